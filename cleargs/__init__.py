@@ -5,7 +5,7 @@ from warnings import warn
 
 __version__ = "0.2.0"
 
-# Loaded when first asked for, so that `import cleargs` costs nothing. Their types stand in __init__.pyi.
+# Modules are imported on first use, so that `import cleargs` is fast. __init__.pyi declares the types.
 _HOMES = {
     "run": "api",
     **dict.fromkeys(("open_run", "Run", "StageResults", "open_prepared", "Prepared"), "run_results"),
@@ -21,7 +21,7 @@ _HOMES = {
 }
 __all__ = list(_HOMES)
 
-# Former name -> present name. The former one works for one release.
+# Former name -> present name. A former name works for one release.
 _RENAMED = {"View": "TrainingView"}
 
 

@@ -21,10 +21,10 @@ from cleargs.splat.gaussians import Gaussians as Gaussians
 from cleargs.splat.scene import Scene as Scene
 from cleargs.splat.views import TrainingView as TrainingView
 
-# An installation has it; a checkout holds the package as stages/, where mypy does not look for it.
+# An installed package has cleargs.stages. In a checkout it is the folder stages/, which mypy does not search.
 from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]
 
-View = TrainingView  # its former name
+View = TrainingView  # former name
 
 __all__: list[str]
 __version__: str

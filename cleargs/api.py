@@ -1,6 +1,7 @@
-"""The library: what the command line does, for programs. ``import cleargs as cg`` brings these names.
+"""The Python API: the functions of ``import cleargs as cg``.
 
-Images are [H, W, 3] sRGB, uint8 or float32 in [0, 1]. Errors are `CleargsError` with a ``hint``.
+Images are [H, W, 3] sRGB, uint8 or float32 in [0, 1]. Errors are `CleargsError` with a ``hint``. The examples
+use a capture ``room`` and its run folder ``run``.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from cleargs.types import AnyImage, ImageF32
 
 Progress = Reporter | Say | None
-"""Where progress and remarks go: to the logger ``cleargs`` (None), to a function that takes lines, or to a
+"""Receiver of progress and remarks: the logger ``cleargs`` (None), a function that receives lines, or a
 `cleargs.progress.Reporter`."""
 
 
@@ -59,10 +60,30 @@ def run(
 ) -> Run:
     """Turn a capture into a clean scene in the run folder ``folder``, as ``cleargs run`` does.
 
-    ``source`` is a video, an image folder, a COLMAP project, or a folder with ``transforms.json``. What is
-    there already is not made again. ``quality`` says what trainings may cost; ``set`` changes settings by
-    name: ``{"rva.tau_R": 0.6}``; an existing run keeps the others, unless a ``workflow`` is given. Raises
-    InputError for what cannot be used as it is, StageError where a stage fails; what was finished stays.
+    Results that are up to date are reused. Finished stages stay if a later stage fails.
+
+    Args:
+        source: A video, an image folder, a COLMAP project, or a folder with ``transforms.json``.
+        folder: The run folder, which is created if necessary.
+        workflow: Name or path of a recipe. Without one, an existing run keeps its settings.
+        quality: Cost of the trainings: draft, standard or high (setting ``g0.quality``).
+        set: Settings by name, for example ``{"rva.tau_R": 0.6}``.
+        until: The last stage to run (default: all stages).
+        force: Stages that run even if their results are up to date.
+        allow_partial: Continue after a stage that could make only a part of its results.
+        seed: Seed of all randomness (default: that of the run, or 0).
+        device: auto, cpu or cuda.
+        threads: Number of threads (default: all usable cores).
+        store: Folder for results (default: that of the run, or ``.store`` in ``folder``).
+        progress: Receiver of progress and remarks.
+
+    Raises:
+        InputError: if the capture or a setting cannot be used.
+        StageError: if a stage fails.
+
+    Example:
+        run = cg.run("room", "run", until="rva", progress=print)
+        print(run["rva"].summary)
     """
     from cleargs.pipeline.runner import Runner
 
@@ -75,7 +96,7 @@ def run(
         workflow=workflow,
         overrides=[
             *([f"g0.quality={quality}"] if quality else []),
-            # JSON's spelling of a value is TOML's too.
+            # Settings are parsed as TOML, which reads these JSON values too.
             *(f"{name}={json.dumps(x, ensure_ascii=False, default=str)}" for name, x in (set or {}).items()),
         ],
         seed=seed,
@@ -96,10 +117,18 @@ def initialise(
     *,
     seed: int = 0,
 ) -> Scene:
-    """The scene that a training starts from: one Gaussian a sparse point, and more between them.
+    """Return a scene to start a training from: one Gaussian per sparse point, and more between them.
 
-    ``views`` (default: all of ``capture``) give the colours of those in between; of ``config`` count
-    ``sh_degree``, ``min_points``, ``budget``, ``quality``, ``antialias`` and ``background``.
+    Args:
+        capture: The capture with poses and sparse points.
+        views: Views that give the added Gaussians their depths and colours (default: all of ``capture``).
+        config: Only ``sh_degree``, ``min_points``, ``budget``, ``quality``, ``antialias`` and ``background``
+            have an effect.
+        seed: Seed of the positions of the added Gaussians.
+
+    Example:
+        capture = cg.open_prepared(cg.open_run("run")["ingest"])
+        scene = cg.initialise(capture, config=cg.G0Config(sh_degree=1))
     """
     from cleargs import G0Config
     from cleargs.capture.tables import load_observations
@@ -133,19 +162,40 @@ def train(
     device: str = "cpu",
     progress: Progress = None,
 ) -> Trained:
-    """Optimise ``scene`` against ``views``; the result has ``scene``, and ``rows``, one a step.
+    """Optimise a scene to match images of it.
 
-    ``formation`` says what the cameras made of the sharp scene: None compares the images with the render as
-    it is, `cleargs.formation.capture.CaptureFormation` finds blur, rolling shutter and defocus. With a
-    ``checkpoint`` file a training that was cut off resumes from it, to the same result. On a CPU the result
-    depends on the arguments alone, not on threads. Raises InputError without a weighted view.
+    On a CPU the result depends only on the arguments, not on the number of threads.
+
+    Args:
+        scene: The scene to start from. It is not changed.
+        views: Images with cameras and weights.
+        config: Settings of the training.
+        formation: Model of how a camera turns the sharp scene into an image. None compares the images with
+            the render itself. `cleargs.formation.capture.CaptureFormation` also fits motion blur, rolling
+            shutter and defocus.
+        seed: Seed of all randomness.
+        checkpoint: File from which an interrupted training resumes, with the same result.
+        device: cpu or cuda.
+        progress: Receiver of progress and remarks.
+
+    Returns:
+        An object with the trained ``scene`` and a table ``rows`` with one row per step.
+
+    Raises:
+        InputError: if no view has a weight above 0.
+
+    Example:
+        capture = cg.open_prepared(cg.open_run("run")["ingest"])
+        start = cg.initialise(capture)
+        trained = cg.train(start, capture.views(), cg.TrainConfig(steps=20))
+        print(trained.rows["loss"][-1])
     """
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.trainer import Trainer
 
     config = config or TrainConfig()
     with tempfile.TemporaryDirectory() as nowhere:
-        if checkpoint is None:  # never written then
+        if checkpoint is None:  # the interval is longer than any training: no checkpoint is written
             config = config.model_copy(update={"checkpoint_interval": 1_000_000})
         trainer = Trainer(scene, views, config, seed=(seed,), formation=formation, device=device)
         return trainer.run(
@@ -155,16 +205,30 @@ def train(
 
 
 def render_view(scene: Scene, camera: Camera) -> Render:
-    """What ``scene`` shows at ``camera``: image, alpha and accumulated depth, differentiable by torch."""
+    """Render a scene. The result is differentiable by torch in the parameters of the Gaussians.
+
+    Returns:
+        ``image`` [H, W, 3] sRGB (may exceed 1), ``alpha`` [H, W], and ``depth`` [H, W]: the sum of weight
+        times camera z. Divide ``depth`` by ``alpha`` for the mean depth in world units.
+
+    Example:
+        run = cg.open_run("run")
+        camera = cg.open_prepared(run["ingest"]).cameras()[0]
+        image = cg.render_view(run.scene(), camera).image.detach().numpy()
+    """
     from cleargs.splat.render import render
 
     return render(scene.gaussians, camera, background=scene.background, antialias=scene.antialias)
 
 
 def save(scene: Scene, path: str | Path) -> None:
-    """Write ``scene`` in the format of the ending: .ply .compressed.ply .sog .spz .glb .usdc.
+    """Write a scene in the format that the file ending names: .ply, .compressed.ply, .sog, .spz, .glb, .usdc.
 
-    Raises InputError for another ending.
+    Raises:
+        InputError: for another ending.
+
+    Example:
+        cg.save(cg.open_run("run").scene(), "room.spz")
     """
     from cleargs.splat.formats import format_of, write_scene
 
@@ -172,7 +236,15 @@ def save(scene: Scene, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> Scene:
-    """Read a ``scene.ply`` of ClearGS or of the Inria code. Raises StoreError when it cannot be read."""
+    """Read a PLY file with Gaussians, as ClearGS and the Inria code write it.
+
+    Raises:
+        StoreError: if the file cannot be read.
+
+    Example:
+        scene = cg.load("run/g0/scene.ply")
+        print(scene.gaussians.num)
+    """
     from cleargs.splat.ply import read_ply
 
     return read_ply(Path(path))
@@ -185,10 +257,27 @@ def score_frames(
     threads: int | None = None,
     progress: Progress = None,
 ) -> pa.Table:
-    """How good each frame of a video looks: a row a file, with RVA's eleven cues, R and B, all in [0, 1].
+    """Rate the image quality of each frame of a video.
 
-    ``paths`` are images in the order in which they were taken. A frame that could not be scored has NaN.
-    Raises ConfigError for an unknown evaluator.
+    Args:
+        paths: Image files in the order in which they were filmed.
+        evaluator: Evaluator of the cues: statistics, qwen3-vl, or one of an installed package.
+        threads: Number of threads (default: all usable cores).
+        progress: Receiver of progress and remarks.
+
+    Returns:
+        A table with one row per file: ``path``, RVA's eleven cues, the reliability ``R`` and the risk of
+        degradation ``B``. All numbers are in [0, 1], or NaN for a frame that could not be scored.
+
+    Raises:
+        ConfigError: for an unknown evaluator.
+
+    Example:
+        from pathlib import Path
+
+        paths = sorted(Path("room/images").iterdir())
+        table = cg.score_frames(paths)
+        print(table.sort_by("R").select(["path", "R", "B"]).slice(0, 3))
     """
     import pyarrow as pa
 
@@ -209,10 +298,21 @@ def score_frames(
 
 
 def score(image: AnyImage, *, scorer: str = "clarity-net", threads: int | None = None) -> float:
-    """How good an image looks without a reference: 0 to 100, higher is better.
+    """Rate the quality of an image without a reference, from 0 to 100 (higher is better).
 
-    ``scorer`` is clarity-net, naturalness-stats, an installed model (``cleargs models list``) or an ONNX
-    file. Raises InputError for another name, and for an image smaller than 32 pixels.
+    Args:
+        image: The image [H, W, 3], uint8 or float32 in [0, 1].
+        scorer: clarity-net, naturalness-stats, an installed model (``cleargs models list``) or an ONNX file.
+        threads: Number of threads (default: all usable cores).
+
+    Raises:
+        InputError: if the scorer is unknown, or if the image is smaller than 32 pixels.
+
+    Example:
+        import numpy as np
+
+        image = np.random.default_rng(0).random((64, 96, 3), np.float32)
+        print(cg.score(image))
     """
     from cleargs.models.scorer import load_scorer
 
@@ -220,9 +320,24 @@ def score(image: AnyImage, *, scorer: str = "clarity-net", threads: int | None =
 
 
 def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = None) -> ImageF32:
-    """A sharper image of the same size [H, W, 3] by a restoration network, float32 in [0, 1].
+    """Restore a degraded image with a neural network.
 
-    ``expert`` is embedded, an installed model or an ONNX file. Raises InputError for another name.
+    Args:
+        image: The image [H, W, 3], uint8 or float32 in [0, 1].
+        expert: embedded, an installed model (``cleargs models list``) or an ONNX file.
+        threads: Number of threads (default: all usable cores).
+
+    Returns:
+        An image of the same size, float32 in [0, 1].
+
+    Raises:
+        InputError: if the expert is unknown.
+
+    Example:
+        import numpy as np
+
+        image = np.random.default_rng(0).random((64, 96, 3), np.float32)
+        print(cg.score(cg.restore(image)))
     """
     from cleargs.models.expert import load_expert
 
@@ -230,11 +345,26 @@ def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = 
 
 
 def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | None:
-    """A raw frame without the motion, rolling shutter and defocus that the scene of ``stage`` explains.
+    """Remove motion blur, rolling shutter and defocus from a raw frame, as fitted by a trained scene.
 
-    A rolling shutter is undone only where the training found that the capture's shutter rolls. The result
-    has ``image`` [H, W, 3] float32, and ``formation``, what was undone; None where nothing explains the frame
-    better than the render as it is. Raises InputError for a frame without a pose.
+    Rolling shutter is removed only if the training detected it in the capture.
+
+    Args:
+        run: A run with a trained scene.
+        frame_id: Number of a frame with a pose.
+        stage: The stage that trained the scene (default: the last one that has a scene).
+
+    Returns:
+        ``image`` [H, W, 3], float32 sRGB in [0, 1], and ``formation``, the effects that were removed. None if
+        no effect explains the frame better than the sharp render.
+
+    Raises:
+        InputError: if the frame has no pose.
+
+    Example:
+        deblurred = cg.deblur(cg.open_run("run"), 3)
+        if deblurred is not None:
+            print(deblurred.formation.blur_px, deblurred.image.shape)
     """
     from cleargs.formation.frames import view_of
     from cleargs.rivr.distillation import TrainedScene
@@ -255,11 +385,27 @@ def evaluate_scene(
     threads: int | None = None,
     progress: Progress = None,
 ) -> Evaluation:
-    """Compare a scene with the sharp images of ``reference`` (``images/`` and ``transforms.json``).
+    """Compare renders of a scene with sharp reference images.
 
-    That of a run (of ``stage``, or the last) is compared in the world of its input, without a ``reference``
-    with the frames held out; a scene or a scene.ply has to be in the world of the reference. ``means`` of
-    the result maps metrics to figures. Raises InputError where nothing matches.
+    Args:
+        scene: A run, a scene or a PLY file. The scene of a run is transformed to the coordinates of its
+            input. Other scenes must be in the coordinates of the reference.
+        reference: A folder with ``images/`` and ``transforms.json`` (default: the held-out frames of the
+            run).
+        stage: The stage of the run whose scene is compared (default: the last one that has a scene).
+        options: Metrics and their settings.
+        threads: Number of threads (default: all usable cores).
+        progress: Receiver of progress and remarks.
+
+    Returns:
+        The evaluation. Its ``means`` map the name of a metric to the mean over all images.
+
+    Raises:
+        InputError: if no image of the reference matches.
+
+    Example:
+        result = cg.evaluate_scene(cg.open_run("run"), "room/truth/observed")
+        print(result.means["psnr"])
     """
     from cleargs.evaluate.config import EvalOptions
     from cleargs.evaluate.evaluate import evaluate_scene

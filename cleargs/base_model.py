@@ -1,4 +1,4 @@
-"""What settings, manifests and reports are made of: models whose values are checked and never change."""
+"""Base classes of settings, manifests and reports: immutable models with checked values."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -11,24 +11,24 @@ Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class FrozenModel(BaseModel):
-    """A frozen model that forbids unknown fields, so that a misspelt name is an error."""
+    """An immutable model without unknown fields, so that a misspelt name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Inherited(NamedTuple):
-    """In the place of a retired setting: the one of the same name in another section, or any value."""
+    """Mark a retired setting that follows the setting of the same name in another section."""
 
     section: str
     strictly: bool = True
-    """False where the retired setting had no effect: whatever it held is dropped."""
+    """False if the retired setting had no effect: any value is dropped."""
 
 
 class Settings(FrozenModel):
-    """A table of a run's settings, which also reads the ``run.toml`` of earlier versions.
+    """A table of settings, which also reads the ``run.toml`` of earlier versions.
 
-    A name that became a constant of the class, or is in ``RETIRED``, is dropped where it holds the value that
-    now applies; otherwise the error says what to set instead.
+    Retired settings are the constants of the class and the names in ``RETIRED``. A retired setting is dropped
+    if it has the value that now applies. Otherwise the error says what to set instead.
     """
 
     RETIRED: ClassVar[Mapping[str, Any]] = {}
@@ -59,7 +59,7 @@ class Settings(FrozenModel):
 
 
 def _alike(now: Any, value: Any) -> bool:
-    """Return True if ``value``, as a document holds it, says nothing else than ``now``."""
+    """Return True if ``value``, from a TOML or JSON document, equals the present value ``now``."""
     if isinstance(value, Mapping):
         return all(_alike(getattr(now, name, inner), inner) for name, inner in value.items())
     return bool((list(now) if isinstance(now, tuple) else now) == value)

@@ -1,4 +1,4 @@
-"""Content digests of files and folders, and a memo that saves hashing the same file twice."""
+"""Content digests of files and folders, and a memo that avoids hashing a file twice."""
 
 from __future__ import annotations
 
@@ -17,36 +17,41 @@ from cleargs.files import External
 from cleargs.safe_io import open_regular, require_utf8
 
 RACY_NS = 2_000_000_000
-"""A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""
+"""Nanoseconds. A file that changed less than this ago is not memoised: it may change again within one tick of
+its time stamp, which is up to 2 s (FAT)."""
 
 COLUMNS = "size, mtime_ns, ctime_ns, inode, digest"
-"""Of the memo, after the path."""
+"""Columns of the memo's table, after the path."""
 
 _Row: TypeAlias = tuple[int, int, int, int, str]
 
 NOTHING: _Row = (-1, -1, -1, -1, "")
-"""The row of a file of which nothing is known: no file has such a state."""
+"""The row of a forgotten file. It matches no file, since sizes and times are not negative."""
 
 
 def json_digest(value: Any) -> str:
-    """sha256 of ``value`` as JSON with sorted keys and no spaces; NaN and infinities are refused."""
+    """Return the SHA-256, in hexadecimal, of ``value`` as JSON with sorted keys and no spaces.
+
+    Raises:
+        ValueError: if ``value`` contains NaN or infinities.
+    """
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def file_digest(path: Path) -> str:
-    """sha256 of the bytes of a regular file, hexadecimal. Raises OSError like `open_regular`."""
+    """Return the SHA-256 of a regular file, in hexadecimal. Raises OSError like `open_regular`."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def tree_digest(files: Mapping[str, str]) -> str:
-    """One digest for many files: ``files`` maps each relative path (POSIX) to the digest of its content."""
+    """Return one digest for many files, given as relative POSIX path -> digest of the content."""
     return json_digest(dict(files))
 
 
 def files_under(path: Path) -> dict[str, Path]:
-    """Relative POSIX path -> file, for each file in the folder ``path`` that is not hidden."""
+    """Return relative POSIX path -> file, for all files below the folder ``path`` that are not hidden."""
     found = {}
     for folder, folders, names in os.walk(path, followlinks=True):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
@@ -58,13 +63,12 @@ def files_under(path: Path) -> dict[str, Path]:
 
 
 class DigestMemo:
-    """Digests by path, size, inode, and times of content (mtime) and state (ctime), kept in an SQLite file.
+    """A cache of digests by path, size, inode, mtime and ctime, stored in an SQLite file.
 
-    Any program may set mtime; ctime only the kernel sets, at every write and also where mtime is put back.
+    Any program can set mtime. Only the kernel sets ctime: at every write, and also when mtime is set back.
 
-    The memo only saves time: where its file is damaged, locked or not writable, digests are computed
-    afresh and nobody is troubled. The file is read at once and written at the end, if its folder is there by
-    then.
+    The memo only saves time: if its file is damaged, locked or not writable, digests are computed again, and
+    no error is raised. The file is read at the start and written at the end, if its folder exists by then.
     """
 
     def __init__(self, path: Path) -> None:
@@ -80,20 +84,20 @@ class DigestMemo:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Write what was learnt."""
+        """Write the new digests to the file."""
         if not self._learnt or not self._path.parent.is_dir():
             return
         try:
             self._write()
         except sqlite3.OperationalError:
             pass  # locked, or not writable: the next run hashes again
-        except sqlite3.DatabaseError:  # damaged: an empty one takes its place
+        except sqlite3.DatabaseError:  # damaged: start a new file
             with suppress(OSError, sqlite3.Error):
                 self._path.unlink(missing_ok=True)
                 self._write()
 
     def digest(self, path: Path) -> str:
-        """The digest of the file at ``path``: remembered where size, times and inode are unchanged."""
+        """Return the digest of the file at ``path``, from the memo if size, times and inode are unchanged."""
         name, state = _state(path)
         known = self._learnt.get(name) or self._known.get(name)
         if known is not None and known[:4] == state:
@@ -104,21 +108,28 @@ class DigestMemo:
         return digest
 
     def remember(self, path: Path, digest: str) -> None:
-        """Note the digest of a file that nobody will write again."""
+        """Store the digest of a file that is not written again, however recent its last change is."""
         name, state = _state(path)
         self._learnt[name] = (*state, digest)
 
     def forget(self, path: Path) -> None:
-        """Drop what is known of ``path``, so that the next `digest` reads the file."""
+        """Drop the digest of ``path``, so that the next `digest` reads the file."""
         self._learnt[str(path.absolute())] = NOTHING
 
-    def digests_of(self, place: External, *, rehash: bool = False) -> dict[str, str]:
-        """Relative path -> digest for a folder, {"": digest} for a file, name -> digest for files by name.
+    def digests_of(self, external: External, *, rehash: bool = False) -> dict[str, str]:
+        """Return the digests of files outside the store.
 
-        With ``rehash`` every file is read, whatever is known of it. Raises InputError when a file is missing
-        or not regular, cannot be read, or has a name that is not UTF-8.
+        Args:
+            external: A file, a folder, or files by name.
+            rehash: Read every file, even if the memo has its digest.
+
+        Returns:
+            ``{"": digest}`` for a file, relative path -> digest for a folder, or name -> digest.
+
+        Raises:
+            InputError: if a file is missing, not regular or not readable, or if its name is not UTF-8.
         """
-        files = named_files(place)
+        files = named_files(external)
         for file in files.values():
             require_utf8(file)
             if rehash:
@@ -138,11 +149,11 @@ class DigestMemo:
             database.executemany("INSERT OR REPLACE INTO contents VALUES (?, ?, ?, ?, ?, ?)", rows)
 
 
-def named_files(place: External) -> dict[str, Path]:
-    """Every file of ``place`` by the name under which its digest is noted."""
-    if isinstance(place, Mapping):
-        return dict(place)
-    return files_under(place) if place.is_dir() else {"": place}
+def named_files(external: External) -> dict[str, Path]:
+    """Return the files of ``external`` by the names that `DigestMemo.digests_of` gives them."""
+    if isinstance(external, Mapping):
+        return dict(external)
+    return files_under(external) if external.is_dir() else {"": external}
 
 
 def _state(path: Path) -> tuple[str, tuple[int, int, int, int]]:

@@ -1,6 +1,6 @@
-"""The errors a user may see: one line of cause (the message) and one line of remedy (the hint).
+"""Errors for users: the message names the cause, and the hint says what to do.
 
-The command line turns each into its exit code and prints no traceback unless ``--debug`` is given.
+The command line turns each error into its exit code. It prints a traceback only with ``--debug``.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from difflib import get_close_matches
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:
-    """The hint for an unknown name: the nearest of ``known``, or ``otherwise`` where none is near."""
+    """Return a hint for an unknown name: the most similar name in ``known``, or ``otherwise`` without one."""
     near = get_close_matches(name, list(known), n=1)
     return f"did you mean {near[0]}?" if near else otherwise
 
 
 class CleargsError(Exception):
-    """Base of every error that ClearGS raises on purpose: the work failed (exit code 1)."""
+    """Base class of all errors that ClearGS raises on purpose (exit code 1)."""
 
     exit_code = 1
 
@@ -26,18 +26,18 @@ class CleargsError(Exception):
 
 
 class InputError(CleargsError):
-    """The input, a setting or a command-line argument cannot be used as it is (exit code 2)."""
+    """The input, a setting or a command-line argument cannot be used (exit code 2)."""
 
     exit_code = 2
 
 
 class ConfigError(InputError):
-    """A recipe or a ``--set`` names an unknown field or a value out of range."""
+    """A recipe or ``--set`` has an unknown name or a value out of range."""
 
 
 class StageError(CleargsError):
-    """A stage could not finish its work, although its input was readable."""
+    """A stage failed although its input was readable."""
 
 
 class StoreError(CleargsError):
-    """The store cannot be read or written (full disk, missing permission)."""
+    """The store or another file cannot be read or written (full disk, missing permission)."""

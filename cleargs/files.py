@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: written beside their place, flushed to disk, renamed into it."""
+"""Atomic writes: a file is written under a temporary name, flushed to disk, and renamed."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ from typing import Any, TypeAlias
 from cleargs.errors import StoreError
 
 External: TypeAlias = Path | Mapping[str, Path]
-"""Files outside the store: one, all of a folder that are not hidden, or single ones by name."""
+"""Files outside the store: a file, a folder (its files that are not hidden), or files by name."""
 
 PARTIAL_SUFFIX = ".partial"
-"""Ending of a file that is being written; whoever finds one may delete it."""
+"""Part of the name of a file or folder that is being written. A leftover one may be deleted."""
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path that becomes ``path`` when the block ends without an error.
 
-    The temporary file keeps the extension of ``path`` (image writers choose their format by it). A writer
-    that dies leaves ``path`` as it was, and of several writers at once, in threads, processes or on nodes
-    that share the disk, the last one wins. Raises StoreError when the disk is full or not writable.
+    The temporary file has the extension of ``path``, by which image writers choose their format. A writer
+    that dies leaves ``path`` unchanged. If several threads, processes or nodes write at once, the last one
+    wins.
+
+    Raises:
+        StoreError: if the disk is full or not writable.
     """
     temporary = path.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{path.name}")
     try:
@@ -44,7 +47,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def whole_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a new folder that becomes ``path`` when the block ends without an error.
 
-    With ``replace`` it takes the place of an older one. Raises StoreError when it cannot be written.
+    With ``replace``, it replaces a folder at ``path``. Raises StoreError if it cannot be written.
     """
     folder = path.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{path.name}")
     old = folder.with_name(f"{folder.name}.old")
@@ -61,7 +64,7 @@ def whole_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def is_partial(path: Path) -> bool:
-    """Whether ``path`` is a leftover of a writer that died."""
+    """Return True if ``path`` is a leftover of a writer that died."""
     return path.name.startswith(".") and PARTIAL_SUFFIX in path.name
 
 
@@ -77,14 +80,14 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def make_folder(path: Path, *, empty: bool = False) -> None:
-    """Have a folder at ``path``, in place of a file that lies there; ``empty`` also without what is in it."""
+    """Create a folder at ``path``, replacing a file or link; with ``empty``, delete what is in the folder."""
     if empty or path.is_symlink() or not path.is_dir():
         remove(path)
     path.mkdir(parents=True, exist_ok=True)
 
 
 def remove(path: Path) -> None:
-    """Have nothing at ``path``: neither a file, nor a link, nor a folder and all in it."""
+    """Delete the file, link or whole folder at ``path``, if there is one."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -92,13 +95,13 @@ def remove(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Have the folder and all in it on the disk: a rename of it then shows all or nothing."""
+    """Flush a folder and all files in it to disk, so that a later rename shows all of them or none."""
     for path in [*folder.rglob("*"), folder]:
         sync(path)
 
 
 def sync(path: Path) -> None:
-    """Have the file or folder ``path`` on the disk."""
+    """Flush the file or folder ``path`` to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -108,7 +111,7 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """While ``path`` is written: what the system refuses becomes the StoreError that says what to do."""
+    """Turn an OSError while ``path`` is written into the StoreError of `disk_error`."""
     try:
         yield
     except OSError as error:
@@ -116,7 +119,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def disk_error(error: OSError, path: Path) -> StoreError:
-    """The StoreError that says what to do about a failed write of ``path``."""
+    """Return the StoreError, with a hint, for a failed write of ``path``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StoreError(
             f"no space left on the disk of {path.parent}", hint="free some space, or choose another --store"

@@ -1,4 +1,4 @@
-"""Where Numba keeps what it compiled: never in the package, which may be read-only or shared."""
+"""Cache folder of Numba's compiled kernels, outside the package, which may be read-only or shared."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 
 
 def cache_folder(name: str) -> Path:
-    """A writable folder ``name`` for compiled kernels, made if needed.
+    """Return a writable folder ``name`` for compiled kernels, creating it if necessary.
 
-    Below ``NUMBA_CACHE_DIR`` where that is set, else below the user's cache folder (``XDG_CACHE_HOME``
-    or ``~/.cache``), else, when none can be written to, a fresh temporary folder.
+    It is in ``NUMBA_CACHE_DIR`` if that is set, else in the user's cache folder (``XDG_CACHE_HOME`` or
+    ``~/.cache``). If neither is writable, it is a new temporary folder.
     """
     own = f"{os.environ.get('XDG_CACHE_HOME') or '~/.cache'}/cleargs"
     for candidate in filter(None, (os.environ.get("NUMBA_CACHE_DIR"), own)):
@@ -26,15 +26,14 @@ def cache_folder(name: str) -> Path:
 
 
 def configure_numba(name: str) -> None:
-    """Point Numba at the folder ``name`` of the cache and at a threading layer; to be called before a kernel
-    is defined.
+    """Set Numba's cache folder and threading layer. Call this before any kernel is defined.
 
-    OpenMP is preferred (any Python thread may start a kernel); where it is missing Numba falls back to
-    its own work queue, for which ``jit.LAUNCHING`` keeps launches apart.
+    OpenMP is preferred, since any Python thread may start a kernel. Without it Numba uses its own work queue,
+    for which ``jit.LAUNCHING`` serialises launches.
     """
     from numba import config
 
-    # By setattr, because Numba makes these settings from the environment and declares none of them.
+    # By setattr, because Numba creates these settings at run time and declares none of them.
     settings = {"CACHE_DIR": str(cache_folder(name)), "THREADING_LAYER_PRIORITY": ["omp", "tbb", "workqueue"]}
     for setting, value in settings.items():
         setattr(config, setting, value)

@@ -1,4 +1,4 @@
-"""``manifest.json``: the last file written into a finished stage folder, and what makes it finished."""
+"""``manifest.json``: the last file that is written into a stage folder, which marks it as finished."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ MANIFEST = "manifest.json"
 
 
 SCHEMA = 1
-"""Raised when the way keys are made changes: every old result becomes a miss."""
+"""Incremented when the computation of keys changes: every old result becomes out of date."""
 
 PRECISION = "float32"
-"""Precision of the parameters that the stages train and publish."""
+"""Number format of the parameters that the stages train and publish."""
 
 
 class KeyParts(FrozenModel):
-    """What goes into the key of one stage."""
+    """Everything that the key of a stage depends on."""
 
     stage: str
     version: int
     config: dict[str, Any]
-    """The stage's own section, without the fields marked by `key_config` as outside the key."""
+    """The stage's section of the settings, without the fields that `key_config` leaves out."""
     inputs: dict[str, dict[str, str | None]]
-    """Upstream stage -> declared path -> digest of its content; None where an optional path is absent."""
+    """Upstream stage -> declared path -> digest of its content; None if an optional path is absent."""
     externals: dict[str, str]
     """Role -> digest of the content of a file or folder outside the store."""
     seed: int
@@ -44,7 +44,7 @@ class KeyParts(FrozenModel):
 
     @property
     def key(self) -> str:
-        """sha256 of the canonical JSON, hexadecimal."""
+        """SHA-256 of the canonical JSON, in hexadecimal."""
         return json_digest(self.model_dump(mode="json"))
 
 
@@ -56,43 +56,46 @@ class FileRecord(FrozenModel):
 
 
 class Manifest(FrozenModel):
-    """What a finished stage folder holds and what it was made from. Names no host and no absolute path."""
+    """Contents and origin of a finished stage folder, without host names and absolute paths."""
 
     stage: str
     key: str
     status: Literal["complete", "partial"]
-    """`partial` when this stage or one before it is done only in part."""
+    """`partial` if this stage or an earlier one is incomplete."""
     missing: tuple[str, ...]
-    """What this stage could not make."""
+    """Results that this stage could not make, one line each."""
     inherited: tuple[str, ...]
-    """What the stages before it could not make, as "STAGE: what"."""
+    """Results that earlier stages could not make, as "STAGE: what"."""
     parts: KeyParts
-    """All that went into the key."""
+    """Everything that the key depends on."""
     origins: dict[str, dict[str, str]]
-    """"STAGE/PATH" (inputs) or role (externals) -> digests of the single files behind it."""
+    """"STAGE/PATH" (inputs) or role (externals) -> digest of each file in it."""
     files: dict[str, FileRecord]
-    """Relative path -> size and digest of every file except this one."""
+    """Relative path -> size and digest of every file except the manifest."""
     digest: str
-    """Digest of the whole tree."""
+    """Digest of all files together (`tree_digest`)."""
     versions: dict[str, str]
     started: str
-    """UTC, ISO 8601."""
+    """Start time in UTC, ISO 8601."""
     seconds: float
     cpu_seconds: float | None = None
-    """Processor time of all threads and child processes; None where an earlier version did the work."""
+    """CPU time of all threads and child processes; None in manifests of earlier versions."""
     peak_memory_gb: float | None = None
-    """Largest resident memory of the process while the stage ran, GB (1e9 bytes)."""
+    """Peak resident memory of the process while the stage ran, GB (1e9 bytes)."""
     device: str
     summary: dict[str, Any]
     """The figures that the stage reports."""
 
     @property
     def bytes(self) -> int:
-        """Size of all files together."""
+        """Total size of all files."""
         return sum(record.size for record in self.files.values())
 
     def under(self, path: str) -> dict[str, str]:
-        """Digests of the file ``path``, or of all files in the folder ``path``; empty without either."""
+        """Return the digests of the file or folder ``path``, as name in the folder ("" for a file) -> digest.
+
+        The result is empty if there is no such file or folder.
+        """
         if path in self.files:
             return {"": self.files[path].digest}
         prefix = path.rstrip("/") + "/"
@@ -104,12 +107,12 @@ class Manifest(FrozenModel):
 
 
 def versions() -> dict[str, str]:
-    """Versions worth noting beside the libraries that enter the key."""
+    """Return the versions that a manifest stores in addition to those of the libraries in the key."""
     return {"cleargs": cleargs.__version__, "python": platform.python_version()}
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write ``manifest`` into ``folder`` atomically, sealed by a digest of its own content."""
+    """Write ``manifest`` into ``folder`` atomically, with a digest of its content as a seal."""
     content = manifest.model_dump(mode="json")
     write_json(folder / MANIFEST, {**content, "seal": json_digest(content)})
 
@@ -117,7 +120,9 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def read_manifest(folder: Path) -> Manifest:
     """Read and check the manifest in ``folder``.
 
-    Raises FileNotFoundError when there is none (the stage is not done), ValueError when it is damaged.
+    Raises:
+        FileNotFoundError: if there is none, because the stage is not finished.
+        ValueError: if it is damaged.
     """
     try:
         content = read_json(folder / MANIFEST)
@@ -132,7 +137,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def linked_manifest(run: Path, stage: str) -> Manifest | None:
-    """The manifest that ``RUN/<stage>`` shows now; None when there is none that can be read."""
+    """Return the manifest in ``RUN/<stage>``; None if it is missing or cannot be read."""
     try:
         return read_manifest(run / stage)
     except (OSError, ValueError):
@@ -140,17 +145,17 @@ def linked_manifest(run: Path, stage: str) -> Manifest | None:
 
 
 def hidden_link(run: Path, stage: str) -> Path:
-    """The link to the results that ``RUN/<stage>`` showed before the settings or inputs changed."""
+    """Return the path of the link to the results of ``stage`` before the settings or inputs changed."""
     return run / f".{stage}.before"
 
 
 def last_shown(run: Path, stage: str) -> Manifest | None:
-    """The manifest that ``RUN/<stage>`` shows, or showed before the settings or inputs changed."""
+    """Return the manifest in ``RUN/<stage>``, or that of before the settings or inputs changed."""
     return linked_manifest(run, stage) or linked_manifest(run, hidden_link(run, stage).name)
 
 
 def published_files(folder: Path) -> dict[str, Path]:
-    """Relative POSIX path -> file, for every file that belongs to the outputs in ``folder``."""
+    """Return relative POSIX path -> file, for every output file in ``folder``."""
     return {
         file.relative_to(folder).as_posix(): file
         for file in sorted(folder.rglob("*"))
@@ -161,10 +166,14 @@ def published_files(folder: Path) -> dict[str, Path]:
 def damages(
     folder: Path, manifest: Manifest, names: Iterable[str], memo: DigestMemo, *, rehash: bool = False
 ) -> Iterator[str]:
-    """What makes the files ``names`` in ``folder`` others than those of ``manifest``.
+    """Yield one message per file that differs from its record in ``manifest``.
 
-    Sizes are always read; digests come through ``memo``, and one that differs is computed again first. With
-    ``rehash`` each file is read.
+    Args:
+        folder: The stage folder.
+        manifest: The manifest of the folder.
+        names: Relative paths of the files to check.
+        memo: Source of digests. A digest that differs is computed again before it is reported.
+        rehash: Read every file, even if ``memo`` has its digest.
     """
     for name in names:
         record, file = manifest.files[name], folder / name
@@ -185,7 +194,7 @@ def damages(
 
 
 def plain_json(value: Any) -> Any:
-    """``value`` as JSON holds it: numpy scalars as numbers, tuples as lists, NaN and infinities as null."""
+    """Convert ``value`` to JSON: numpy scalars to numbers, tuples to lists, NaN and infinity to None."""
 
     def plain(unknown: Any) -> Any:
         return unknown.tolist() if hasattr(unknown, "tolist") else str(unknown)

@@ -1,4 +1,4 @@
-"""Parquet tables with a documented schema: one row an item, units and meaning in the field metadata."""
+"""Parquet tables whose schema documents the meaning and unit of each column in the field metadata."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cleargs.files import atomic_path
 
 
 def column(name: str, kind: pa.DataType, meaning: str, *, nullable: bool = False) -> pa.Field:
-    """A field whose ``meaning`` (with its unit and range) travels in the file."""
+    """Return a field whose ``meaning``, with its unit and range, is stored in the file."""
     return pa.field(name, kind, nullable=nullable, metadata={"meaning": meaning})
 
 
@@ -39,9 +39,10 @@ def schema_of(row: type) -> pa.Schema:
 
 
 def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:
-    """Write ``table`` with exactly ``schema`` to ``path``: zstd, atomically, the same bytes for equal rows.
+    """Write ``table`` with exactly ``schema`` to ``path``, atomically. Equal rows give equal bytes.
 
-    Raises ValueError (pyarrow's ArrowInvalid included) when a column is missing or does not fit its type.
+    Raises:
+        ValueError: if a column is missing or does not fit its type (also pyarrow's ArrowInvalid).
     """
     table = table.select(schema.names).cast(schema)
     with atomic_path(path) as temporary:
@@ -49,10 +50,12 @@ def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:
 
 
 def read_table(path: Path, schema: pa.Schema) -> pa.Table:
-    """Read a table written by `write_table`; columns of ``schema`` in its order.
+    """Read a table that `write_table` wrote, with the columns of ``schema`` in its order.
 
-    A nullable column that the file of an older version lacks is null. Raises StoreError when the file is
-    missing, damaged, or lacks another column.
+    A nullable column that the file of an older version lacks is filled with nulls.
+
+    Raises:
+        StoreError: if the file is missing or damaged, or if it lacks another column.
     """
     with read_errors(path):
         table = pq.read_table(path)
@@ -63,14 +66,14 @@ def read_table(path: Path, schema: pa.Schema) -> pa.Table:
 
 
 def read_any_table(path: Path) -> pa.Table:
-    """Read a table with whatever columns it has. Raises StoreError when it is missing or damaged."""
+    """Read a table with all its columns. Raises StoreError if it is missing or damaged."""
     with read_errors(path):
         return pq.read_table(path)
 
 
 @contextmanager
 def read_errors(path: Path) -> Iterator[None]:
-    """While a table is read: what cannot be read becomes a StoreError that names it."""
+    """Turn an error while the table at ``path`` is read into a StoreError that names it."""
     try:
         yield
     except (OSError, pa.ArrowException, ValueError, KeyError) as error:

@@ -1,10 +1,10 @@
-"""What other packages add: an entry point in the group of a socket, found by its name when it is asked for.
+"""Plugins: entry points of installed packages, in the group of an extension point.
 
     [project.entry-points."cleargs.evaluators"]
     mine = "my_package.frames:make_evaluator"
 
-Nothing is imported before a setting names it. What a part computes may depend on its arguments and on the
-version of its distribution alone: that version enters the key of every stage whose settings name the part.
+A plugin is imported only when a setting names it. Its results may depend only on its arguments and on the
+version of its package: that version enters the key of every stage whose settings name the plugin.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ExtensionPoint = Literal["evaluators", "experts", "scorers", "formats", "layouts
 
 
 def installed_version(distribution: str) -> str:
-    """The installed version of a package; "absent" without one."""
+    """Return the installed version of a package, or "absent"."""
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -27,35 +27,51 @@ def installed_version(distribution: str) -> str:
 
 
 def plugins(point: ExtensionPoint) -> dict[str, EntryPoint]:
-    """Name -> part that the installed packages bring for a socket; of two of a name, the first by package."""
-    parts = sorted(entry_points(group=f"cleargs.{point}"), key=package_of, reverse=True)
-    return {part.name: part for part in parts}
+    """Return name -> plugin for an extension point. For equal names, the first package by name wins."""
+    found = sorted(entry_points(group=f"cleargs.{point}"), key=package_of, reverse=True)
+    return {plugin.name: plugin for plugin in found}
 
 
-def package_of(part: EntryPoint) -> tuple[str, str]:
-    """Name and version of the package that brings ``part``."""
-    return ("unknown", "unknown") if part.dist is None else (part.dist.name, part.dist.version)
+def package_of(plugin: EntryPoint) -> tuple[str, str]:
+    """Return the name and version of the package that provides ``plugin``."""
+    return ("unknown", "unknown") if plugin.dist is None else (plugin.dist.name, plugin.dist.version)
 
 
-def load_part(point: ExtensionPoint, name: str) -> Any:
-    """What the entry point of that name refers to. Raises InputError where there is none, or it is broken."""
-    part = plugins(point).get(name)
-    if part is None:
-        raise InputError(f"no installed package brings {name!r}", hint=f"install it: cleargs.{point}")
+def load_plugin(point: ExtensionPoint, name: str) -> Any:
+    """Import the plugin ``name``, and return the object that its entry point refers to.
+
+    Raises:
+        InputError: if no package provides the plugin, or if its import fails.
+    """
+    plugin = plugins(point).get(name)
+    if plugin is None:
+        raise InputError(
+            f"no installed package provides {name!r}",
+            hint=f"install a package with this entry point in the group cleargs.{point}",
+        )
     try:
-        return part.load()
+        return plugin.load()
     except Exception as error:
-        package, version = package_of(part)
+        package, version = package_of(plugin)
         raise InputError(
             f"{name} of {package} {version} cannot be loaded: {type(error).__name__}: {error}",
-            hint=f"repair or uninstall {package}, or name another part",
+            hint=f"repair or uninstall {package}, or choose another plugin",
         ) from error
 
 
 def require_known(point: ExtensionPoint, name: str, shipped: Iterable[str]) -> str:
-    """``name``, where it ships with ClearGS or a package brings it. Raises ValueError with what was meant."""
+    """Return ``name`` if it is one of ``shipped`` or an installed plugin.
+
+    Args:
+        point: The extension point.
+        name: The name in the setting.
+        shipped: Names that ClearGS itself provides.
+
+    Raises:
+        ValueError: if ``name`` is unknown. The message suggests a known name.
+    """
     shipped = tuple(shipped)
-    if name in shipped:  # without a look at what is installed
+    if name in shipped:  # faster: installed packages are not searched
         return name
     names = [*shipped, *plugins(point)]
     if name in names:

@@ -1,4 +1,4 @@
-"""How long work tells what it is doing, without knowing who listens (a terminal, a log, nobody)."""
+"""Progress and remarks of long work, for any receiver: a terminal, a log or none."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Protocol
 from cleargs.safe_io import printable
 
 Say = Callable[[str], object]
-"""Is told a line."""
+"""A function that receives a line."""
 
 PREVIEW = "preview.png"
-"""A picture of the work so far, which a stage may leave among its checkpoints."""
+"""File with a picture of the work so far, which a stage may store in its checkpoint folder."""
 
 
 LINE_EVERY = 10.0
@@ -23,42 +23,46 @@ LINE_EVERY = 10.0
 
 
 class Task(Protocol):
-    """One piece of counted work."""
+    """A piece of work whose steps are counted."""
 
     def advance(self, steps: int = 1) -> None:
-        """``steps`` more are done."""
+        """Report that ``steps`` more steps are done."""
 
     def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
-        """``done`` in all are done; ``note`` (a few figures, say) is shown beside the bar. ``share`` of the
-        work is behind us, where steps differ so much that their number does not say.
+        """Report the state of the work.
+
+        Args:
+            done: Number of steps done so far.
+            note: A short text to show next to the progress bar, for example a few figures.
+            share: Share of the work that is done, if it differs much from the share of the steps.
         """
 
 
 class Reporter(Protocol):
-    """Where progress and remarks go."""
+    """Receiver of progress and remarks."""
 
     def task(self, label: str, total: int | None = None) -> AbstractContextManager[Task]:
-        """Open a piece of work of ``total`` steps (None: unknown); it closes with the block."""
+        """Open a task of ``total`` steps (None: unknown), which closes at the end of the block."""
 
     def info(self, text: str) -> None:
-        """A remark worth a line."""
+        """Report a remark of one line."""
 
     def warn(self, text: str) -> None:
-        """Something the user should look at, although the work continues."""
+        """Report something that the user should check, although the work continues."""
 
 
 class Rate:
-    """Steps a second, of the last seconds: where steps grow longer, the mean of all would flatter."""
+    """Steps per second over the last seconds, since steps of a training become slower."""
 
     SECONDS = 10.0
-    """It is that of one to two times so many seconds, of fewer at the beginning."""
+    """Averaging window: one to two times this many seconds, less at the beginning."""
 
     def __init__(self) -> None:
         self._readings: list[tuple[float, int]] = []
-        """Time and steps done: where the rate counts from, then where it will."""
+        """Up to two pairs of time and steps done: the start of the present window and of the next one."""
 
     def per_second(self, done: int) -> float | None:
-        """To be asked whenever ``done`` grows; None at first."""
+        """Return the rate; None at first. Call this each time ``done`` grows."""
         now = time.monotonic()
         begin = self._readings[0] if self._readings else None
         if begin is None or now - self._readings[-1][0] >= self.SECONDS:
@@ -67,18 +71,18 @@ class Rate:
 
 
 Show = Callable[[int, str, float | None], None]
-"""Is told of a task: the steps done, the note, and the seconds left."""
+"""A function that receives the state of a task: the steps done, the note, and the seconds left."""
 
 
 class CountedTask:
-    """Counted work; each change calls ``show``."""
+    """A task that calls ``show`` after each change."""
 
     def __init__(self, total: int | None, show: Show) -> None:
         self.done, self.note = 0, ""
         self._total, self._show = total, show
         self._first: tuple[float, float] | None = None
-        """When the first step was done, and the share of the work that it was. What comes before that step
-        (compiling kernels, reading a checkpoint) says nothing of those to come."""
+        """Time after the first step, and the share of the work done by then. Work before that moment, such as
+        compiling kernels or reading a checkpoint, does not count for the estimate."""
 
     def advance(self, steps: int = 1) -> None:
         self.update(done=self.done + steps)
@@ -89,7 +93,7 @@ class CountedTask:
         self._show(self.done, self.note, self._seconds_left(share))
 
     def _seconds_left(self, share: float | None) -> float | None:
-        """The time that the task will still take by its pace so far; None while that is not known."""
+        """Return the estimated remaining time of the task; None while it is unknown."""
         if not self._total or not self.done:
             return None
         now = time.monotonic()
@@ -99,7 +103,7 @@ class CountedTask:
 
 
 class SilentReporter:
-    """A reporter nobody listens to."""
+    """A reporter that discards everything."""
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
@@ -111,7 +115,7 @@ class SilentReporter:
 
 
 class LineReporter:
-    """A reporter that passes lines on to functions: remarks, warnings, and how far each task is."""
+    """A reporter that passes lines to functions: remarks, warnings, and the progress of each task."""
 
     def __init__(self, info: Say, warn: Say, progress: Say) -> None:
         self._info, self._warn, self._progress = info, warn, progress
@@ -141,6 +145,6 @@ class LineReporter:
 
 
 def log_reporter() -> LineReporter:
-    """The reporter of the library: lines go to the logger ``cleargs``, where a program routes them."""
+    """Return a reporter that writes to the logger ``cleargs``, the default of the Python API."""
     logger = logging.getLogger("cleargs")
     return LineReporter(*(partial(log, "%s") for log in (logger.info, logger.warning, logger.debug)))

@@ -1,4 +1,4 @@
-"""Which random numbers a draw takes: those of one purpose never depend on how many another draws."""
+"""Separate streams of random numbers, so that the numbers of one purpose do not depend on other draws."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Stream(IntEnum):
-    """Purposes of random numbers, after the seed. Results depend on the values: they stay."""
+    """Purposes of random numbers. The value follows the seed, so a changed value changes results."""
 
     REAL_VIEWS = 0
     PSEUDO_VIEWS = 1
@@ -18,7 +18,7 @@ class Stream(IntEnum):
     LEFT_OUT_POINTS = 101
     UNSEEN_PIXELS = 102
 
-    # Of synthetic captures.
+    # For synthetic captures.
     ROOM = 11
     HAND = 12
     MIXED_FAULTS = 13

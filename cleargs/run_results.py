@@ -1,4 +1,4 @@
-"""What lies in a run folder: finished stages, their tables, the scene; and a prepared capture."""
+"""Results of a run folder: finished stages, their tables and scenes, and the prepared capture."""
 
 from __future__ import annotations
 
@@ -22,41 +22,50 @@ if TYPE_CHECKING:
 
 
 SCENE = "scene.ply"
-"""What a stage that trains leaves."""
+"""File name of the scene in the results of a stage that trains."""
 
 
 def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
-    """The stage whose scene to take: ``chosen``, or the last that has one.
+    """Return the stage ``chosen``, or the last stage that has a scene.
 
-    Raises InputError when there is no such scene.
+    Raises:
+        InputError: if there is no such scene.
     """
     done = [name for name in dag.names if (run / name / SCENE).is_file()]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:
         return stage
-    place = f"{stage} has no scene in {run}" if stage else f"there is no scene in {run}"
+    message = f"{stage} has no scene in {run}" if stage else f"there is no scene in {run}"
     others = f"; the stages with a scene are {', '.join(done)}" if done else ""
-    raise InputError(place, hint=f"see cleargs status {run}{others}")
+    raise InputError(message, hint=f"see cleargs status {run}{others}")
 
 
 def open_run(folder: str | Path) -> Run:
-    """The run in ``folder``. Raises InputError when there is none."""
+    """Open the run in ``folder``.
+
+    Raises:
+        InputError: if ``folder`` is not a run.
+
+    Example:
+        run = cg.open_run("run")
+        print(run.stages, run.scene().gaussians.num)
+    """
     return Run(read_run_file(Path(folder), installed()).folder)
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder: ``run["rva"]`` is a finished stage."""
+    """A run folder. ``run["rva"]`` gives the results of a finished stage."""
 
     folder: Path
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The finished stages, in order."""
+        """Names of the finished stages, in order."""
         return tuple(name for name in installed().names if (self.folder / name).is_dir())
 
     def __getitem__(self, stage: str) -> StageResults:
-        """The results of a stage. Raises InputError where it is not finished."""
+        """Return the results of a stage. Raises InputError if it is not finished."""
         installed().check(stage)
         try:
             return StageResults(self.folder / stage, read_manifest(self.folder / stage))
@@ -66,31 +75,38 @@ class Run:
             ) from error
 
     def scene(self, stage: str | None = None) -> Scene:
-        """The scene of ``stage``, or of the last that has one. Raises InputError where there is none."""
+        """Read the scene of ``stage``, or of the last stage that has one. Raises InputError without one."""
         from cleargs.splat.ply import read_ply
 
         return read_ply(self.scene_file(stage))
 
     def scene_file(self, stage: str | None = None) -> Path:
-        """The file of `scene`."""
+        """Return the path of the file that `scene` reads. Raises InputError without one."""
         return self.folder / scene_stage(installed(), self.folder, stage) / SCENE
 
 
 @dataclass(frozen=True)
 class StageResults:
-    """What a finished stage left in ``folder``, and the manifest that says from what."""
+    """Results of a finished stage, and the manifest that records their origin."""
 
     folder: Path
     manifest: Manifest
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The figures that the stage reports."""
+        """Figures that the stage reports."""
         return self.manifest.summary
 
     def table(self, name: str) -> pa.Table:
-        """The table ``name`` (``frames``, say), all its columns. Raises InputError where there is none,
-        StoreError where it is damaged.
+        """Read the table ``name``, for example ``frames``, with all its columns.
+
+        Raises:
+            InputError: if the stage has no such table.
+            StoreError: if the table is damaged.
+
+        Example:
+            table = cg.open_run("run")["rva"].table("frames")
+            print(table.select(["name", "role", "weight"]))
         """
         from cleargs.parquet import read_any_table
 
@@ -103,31 +119,45 @@ class StageResults:
         return read_any_table(path)
 
     def weights(self) -> dict[int, float]:
-        """Frame -> weight of its supervision in [0, 1]: of ``rva``."""
+        """Return frame_id -> weight in training, in [0, 1]. Only the stage ``rva`` has weights."""
         table = self.table("frames")
         return dict(zip(table["frame_id"].to_pylist(), table["weight"].to_pylist(), strict=True))
 
 
 def open_prepared(folder: StageResults | str | Path) -> Prepared:
-    """The frames, cameras and points of a finished ``ingest`` (``run["ingest"]``, or its folder)."""
+    """Open the frames, cameras and sparse points of a finished ``ingest``.
+
+    Args:
+        folder: ``run["ingest"]`` or its folder.
+
+    Example:
+        run = cg.open_run("run")
+        capture = cg.open_prepared(run["ingest"])
+        views = capture.views(run["rva"].weights())
+    """
     from cleargs.capture.tables import load_frames, load_points
 
-    place = folder.folder if isinstance(folder, StageResults) else Path(folder)
-    return Prepared(place, load_frames(place), load_points(place))
+    path = folder.folder if isinstance(folder, StageResults) else Path(folder)
+    return Prepared(path, load_frames(path), load_points(path))
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A capture with poses, in the normalised world: the farthest camera is at distance 1 of the origin."""
+    """A capture with poses, in normalised coordinates: the farthest camera has distance 1 from the origin."""
 
     folder: Path
     frames: list[Frame]
-    """All of them, by frame_id; those without a pose too."""
+    """All frames by frame_id, including those without a pose."""
     points: Points
 
     def views(self, weights: Mapping[int, float] | None = None) -> list[TrainingView]:
-        """What a training looks at: the frames with a pose, not held out, whose weight (default: 1) is
-        above 0. Images are read when they are needed.
+        """Return the views of a training: the frames with a pose that are not held out.
+
+        Args:
+            weights: frame_id -> weight (default: 1 for all). Frames with weight 0 are left out.
+
+        Returns:
+            Views that read their images when these are needed.
         """
         from cleargs.formation.frames import real_views
 
@@ -135,7 +165,7 @@ class Prepared:
         return real_views(self.frames, given, self.folder)
 
     def cameras(self) -> dict[int, Camera]:
-        """Frame -> camera, of every frame with a pose, held-out ones too."""
+        """Return frame_id -> camera for all frames with a pose, including held-out frames."""
         from cleargs.formation.frames import view_of
 
         posed = (frame for frame in self.frames if frame.registered)

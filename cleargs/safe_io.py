@@ -1,8 +1,7 @@
-"""Files that somebody else wrote: opened only where they are regular, read only up to a stated size, and
-their text made harmless for a terminal.
+"""Safe reading of untrusted files: only regular files, only up to a size limit, and no control characters.
 
-A FIFO or a device in place of a file would block its reader, or never end; a size, a count or a depth that a
-file only claims would take all memory.
+A FIFO or a device in place of a file could block its reader or never end. A wrong size, count or depth in a
+file could exhaust the memory.
 """
 
 from __future__ import annotations
@@ -20,30 +19,30 @@ from typing import Any
 from cleargs.errors import InputError
 
 MAX_BYTES = 4 * 2**30
-"""Most bytes of a file that is read as a whole (an image, a sparse model, a scene, a network)."""
+"""Maximum size of a file that is read as a whole (an image, a sparse model, a scene, a network)."""
 
 MAX_TEXT_BYTES = 256 * 2**20
-"""Most bytes of a document (JSON, TOML, CSV); transforms.json of 100,000 frames has 80 MB."""
+"""Maximum size of a document (JSON, TOML, CSV). A transforms.json of 100,000 frames has 80 MB."""
 
 FAULTS: tuple[type[Exception], ...] = (
     OSError,
-    ValueError,  # UnicodeDecodeError and JSONDecodeError are such
+    ValueError,  # includes UnicodeDecodeError and JSONDecodeError
     TypeError,
     LookupError,
     AttributeError,
-    ArithmeticError,  # OverflowError and ZeroDivisionError are such
+    ArithmeticError,  # includes OverflowError and ZeroDivisionError
     RecursionError,
     struct.error,
 )
-"""What decoding a file of the wrong form may raise. Readers catch these where they say what they read."""
+"""Exceptions that decoding a malformed file may raise. Each reader turns them into its own error."""
 
 
 _HARMFUL = ("Cc", "Cs", "Zl", "Zp")
-"""Unicode categories that a terminal acts on, or cannot show: control characters, halves of surrogates, line
+"""Unicode categories that a terminal acts on or cannot show: control characters, surrogates, line separators
 and paragraph separators."""
 
 _BIDI = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
-"""They reorder what stands around them, so that a name may read as another."""
+"""Characters that reorder the text around them, so that one name may look like another."""
 
 TOO_DEEP = "it is nested too deeply"
 
@@ -51,39 +50,38 @@ TOO_DEEP = "it is nested too deeply"
 def open_regular(path: Path) -> BufferedReader:
     """Open the regular file at ``path``, or the one that it links to, for reading.
 
-    Raises OSError: there is no such file, it may not be read, or it is a folder, a FIFO or a device.
+    Raises:
+        OSError: if the file is missing or not readable, or if it is a folder, a FIFO or a device.
     """
     if "\0" in str(path):
-        raise OSError(errno.EINVAL, "the name holds a zero byte", str(path))
-    # Without O_NONBLOCK the call itself would wait for a FIFO's writer.
+        raise OSError(errno.EINVAL, "the name contains a zero byte", str(path))
+    # Without O_NONBLOCK, opening a FIFO would wait for its writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise OSError(errno.EINVAL, "it is no regular file", str(path))
+            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
         raise
 
 
-def read_bytes(path: Path, at_most: int = MAX_BYTES) -> bytes:
-    """The content of the regular file at ``path``. Raises OSError for none such, and a larger one."""
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read the regular file at ``path``. Raises OSError like `open_regular`, and for a larger file."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size > at_most:
-            raise OSError(errno.EFBIG, f"it has {size} bytes, at most {at_most} are read", str(path))
-        return file.read(at_most)
+        if size > max_bytes:
+            raise OSError(errno.EFBIG, f"it has {size} bytes, the limit is {max_bytes}", str(path))
+        return file.read(max_bytes)
 
 
 def read_text(path: Path) -> str:
-    """The UTF-8 text at ``path``, without a byte order mark. Raises OSError like `read_bytes`, and
-    UnicodeDecodeError.
-    """
+    """Read UTF-8 text without its byte order mark. Raises OSError (see `read_bytes`), UnicodeDecodeError."""
     return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig")
 
 
 def read_json(path: Path) -> Any:
-    """The JSON document at ``path``. Raises OSError like `read_bytes`, ValueError where it is no JSON."""
+    """Read a JSON document. Raises OSError like `read_bytes`, and ValueError if it is not JSON."""
     try:
         return json.loads(read_bytes(path, MAX_TEXT_BYTES))
     except RecursionError:
@@ -91,37 +89,41 @@ def read_json(path: Path) -> Any:
 
 
 def cause(error: Exception) -> str:
-    """Why a file cannot be read, in one line without its path: what one of `FAULTS` says."""
+    """Return the cause of one of the `FAULTS` in one line, without the path of the file."""
     if isinstance(error, OSError):
         return error.strerror or str(error)
     if isinstance(error, KeyError):
         return f"{error.args[0]!r} is missing" if error.args else "something is missing"
-    for kind, words in (
+    for kind, message in (
         (UnicodeDecodeError, "it is not UTF-8 text"),
-        (struct.error, "it breaks off"),
+        (struct.error, "it is truncated"),
         (OverflowError, "a number is too large"),
-        (ZeroDivisionError, "a number is zero that must not be"),
+        (ZeroDivisionError, "a number is zero that must not be zero"),
         (RecursionError, TOO_DEEP),
     ):
         if isinstance(error, kind):
-            return words
+            return message
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def printable(text: str, keep: str = "") -> str:
-    r"""``text`` with control, bidirectional and undecodable characters (but those in ``keep``) as ``\u001b``.
+    r"""Replace control, bidirectional and undecodable characters by escapes such as ``\u001b``.
 
-    Names come from files: an escape sequence in one could write the clipboard, clear the screen or forge a
-    line. The form is JSON's, so that escaped JSON is the same document.
+    Names come from files: an escape sequence in a name could write to the clipboard, clear the screen or
+    forge a line. The escapes are those of JSON, so that escaped JSON is the same document.
+
+    Args:
+        text: The text to print.
+        keep: Characters that are not replaced.
     """
     if text.isascii() and text.isprintable():
         return text
-    acting = {c for c in text if unicodedata.category(c) in _HARMFUL or c in _BIDI}.difference(keep)
-    return "".join(f"\\u{ord(character):04x}" if character in acting else character for character in text)
+    harmful = {c for c in text if unicodedata.category(c) in _HARMFUL or c in _BIDI}.difference(keep)
+    return "".join(f"\\u{ord(character):04x}" if character in harmful else character for character in text)
 
 
 def require_utf8(path: Path | str) -> None:
-    """Raise InputError where the name of ``path`` is not UTF-8: no table and no report could hold it."""
+    """Raise InputError if the name of ``path`` is not UTF-8, since tables and reports could not store it."""
     try:
         str(path).encode()
     except UnicodeEncodeError as error:

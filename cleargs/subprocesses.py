@@ -1,4 +1,4 @@
-"""How Python child processes are started."""
+"""Command lines of Python child processes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import sys
 
 
 def module_command(module: str, *arguments: str) -> list[str]:
-    """``python -m module arguments``, without the working folder on its path.
+    """Return the command ``python -m module arguments``, without the working folder on the import path.
 
-    Without ``-P``, ``-m`` puts the working folder first: a file ``json.py`` beside the user's photos would be
-    imported, and run, in place of the standard library's.
+    ``-P`` removes it. Otherwise a file ``json.py`` next to the user's photos would be imported, and run, in
+    place of the module of the standard library.
     """
     return [sys.executable, "-P", "-m", module, *arguments]

@@ -1,5 +1,6 @@
-"""The five stages, in order. The runner loads ``cleargs.stages.<name>`` by name; each module fulfils
-`cleargs.pipeline.stage.Stage`.
+"""The five stages, in order.
+
+The runner loads ``cleargs.stages.<name>`` by name. Each module implements `cleargs.pipeline.stage.Stage`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,14 @@ STAGES = ("ingest", "rva", "g0", "rivr", "consolidate")
 
 
 def pace(say: Callable[[str], None] | None = None) -> float:
-    """This machine's time over that of the one on which the stages' estimates were measured."""
+    """Return the time of this machine relative to the machine on which the estimates were measured."""
     from cleargs.splat.pace import machine_pace
 
     return machine_pace(say)
+
+
+def gpu_fault(error: BaseException) -> str | None:
+    """Return in one line what failed on the GPU if that is the cause of ``error``, else None."""
+    from cleargs.splat.kernels.cuda.support import gpu_fault
+
+    return gpu_fault(error)

@@ -1,4 +1,4 @@
-"""What RIVR and the consolidation share: the settings of a training that goes on with a scene."""
+"""Settings that rivr and consolidate share, for trainings that continue from a scene."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig, steps_from_frames
 
 G0_END, ROUNDS_END = 16 / 19, 18 / 19
-"""Where in the schedule of the whole method the first scene is done, and where RIVR's rounds are."""
+"""Shares of the schedule of the whole method at which the first scene and RIVR's rounds end."""
 
 MAX_ROUNDS = 16
-"""Most rounds of RIVR."""
+"""Maximum number of RIVR's rounds."""
 
 TRAINED = ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors")
-"""Outputs of a training from which the next one goes on."""
+"""Outputs of a training from which the next training continues."""
 
 REPAIR_LIBRARIES = (
     "torch",
@@ -39,7 +39,7 @@ _GROWTH = (
 
 
 def other_libraries(device: Device) -> Mapping[str, str]:
-    """What else computes on ``device`` in RIVR and in the consolidation."""
+    """Return the versions of the other libraries that compute on ``device`` in rivr and consolidate."""
     from cleargs.models.onnx import runtime_version
 
     kernels = {"triton": installed_version("triton")} if device == "cuda" else {}
@@ -47,7 +47,7 @@ def other_libraries(device: Device) -> Mapping[str, str]:
 
 
 class DistilConfig(Settings):
-    """Joint distillation of raw frames and repairs. Whatever is not here is as [g0] has it."""
+    """Joint distillation of raw frames and repairs. Settings that are missing here are those of [g0]."""
 
     RETIRED: ClassVar[Mapping[str, Any]] = {
         **{name: Inherited("g0") for name in (*TrainConfig.model_fields, *TrainConfig.__class_vars__)},
@@ -60,23 +60,27 @@ class DistilConfig(Settings):
         None,
         ge=1,
         le=1_000_000,
-        description="optimisation steps, one view each; unset = a sixteenth of a first scene's. What this "
-        "table does not name is as in [g0]",
+        description="optimisation steps, one view each; unset: a sixteenth of the steps of a first scene. "
+        "Settings that this table does not have are those of [g0]",
     )
-    begin: float = Field(0.0, ge=0, lt=1, description="share of the schedule that lies behind when it begins")
-    end: float = Field(1.0, gt=0, le=1, description="share of the schedule that lies behind when it ends")
-    densify: bool = Field(False, description="change the number and places of the Gaussians")
+    begin: float = Field(0.0, ge=0, lt=1, description="start of this training in the schedule, from 0 to 1")
+    end: float = Field(1.0, gt=0, le=1, description="end of this training in the schedule, from 0 to 1")
+    densify: bool = Field(False, description="change the number and positions of the Gaussians")
     pseudo_share: Annotated[float, Field(ge=0, le=1)] | Literal["even"] = Field(
         0.7,
-        description="share of the steps that draw a repaired view; even: the repaired views' share of all "
-        "views, so that each is drawn as often as any raw one",
+        description="share of the steps that draw a repaired view; even: the share of repaired views among "
+        "all views, so that each view is drawn equally often",
     )
     pseudo_weight: float = Field(0.5, ge=0, description="factor on the loss of a repaired view")
 
     def applied_to(self, g0: TrainConfig, frames: int) -> TrainConfig:
-        """The settings of a training on so many active frames, where the first scene has ``g0``.
+        """Return the settings of a training that continues from the first scene.
 
-        What pulls opacities and scales down, so that Gaussians die and are placed again, is off.
+        The regularisation of opacities and scales is off: it serves to remove and relocate Gaussians.
+
+        Args:
+            g0: Settings of the first scene.
+            frames: Number of active frames.
         """
         share = (1.0 - ROUNDS_END) / G0_END
         inherited = {name: getattr(g0, name) for name in TrainConfig.model_fields}

@@ -1,4 +1,4 @@
-"""What the stages that train are expected to take."""
+"""Estimates of the cost of the stages that train."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from cleargs.errors import StoreError
 from cleargs.pipeline.stage import StageContext
 
 _UNKNOWN = (60, 0.5)
-"""Frames and megapixels assumed where nothing is known of the capture."""
+"""Number of frames, and megapixels per frame, that are assumed for an unknown capture."""
 _POINTS_PER_FRAME = 250
-"""Sparse points assumed before ingest: captures of 16 to 150 frames gave 80 to 350."""
+"""Sparse points per frame that are assumed before ingest: captures of 16 to 150 frames gave 80 to 350."""
 _SERIAL = 0.1
-"""Share of the work that more threads do not speed up (a guess)."""
+"""Share of the work that is not parallel (a guess)."""
 
 
 def capture_size(context: StageContext[Any]) -> tuple[int, float]:
-    """Registered training frames of a capture, and the megapixels of one; before ingest, what it expects."""
+    """Return the number of placed training frames, and megapixels per frame. Estimate both before ingest."""
     if (expected := context.expected.get("ingest")) is not None and expected.frames:
         return expected.frames, expected.megapixels
     if "ingest" not in context.inputs:
@@ -31,7 +31,7 @@ def capture_size(context: StageContext[Any]) -> tuple[int, float]:
 
 
 def sparse_points(context: StageContext[Any]) -> int:
-    """Sparse points of a capture; before ingest, and where they cannot be read, as its frames let expect."""
+    """Return the number of sparse points. Estimate it before ingest, and if the points cannot be read."""
     if "ingest" in context.inputs:
         with suppress(StoreError):
             return len(load_points(context.inputs["ingest"]).point_id)
@@ -39,5 +39,5 @@ def sparse_points(context: StageContext[Any]) -> int:
 
 
 def pace(threads: int) -> float:
-    """Time on so many threads over that on two, on which the stages were measured."""
+    """Return the time on ``threads`` threads relative to the measurements on two threads (Amdahl's law)."""
     return (_SERIAL + (1.0 - _SERIAL) / threads) / (_SERIAL + (1.0 - _SERIAL) / 2)

@@ -1,4 +1,4 @@
-"""RVA: judge every training frame by its pixels and its place in the scene, and weight its supervision."""
+"""RVA: rate each training frame by its image quality and its position in the scene, and set its weight."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cleargs.rva.config import AssessmentConfig, EvaluatorConfig
 
 
 class RvaConfig(AssessmentConfig, EvaluatorConfig):
-    """Reliability-aware View Allocation. The defaults are the paper's but for `active_share`."""
+    """Reliability-aware View Allocation. The defaults are those of the paper, except `active_share`."""
 
 
 VERSION = 4
@@ -23,20 +23,23 @@ OUTPUTS = ("frames.parquet", "bins.parquet")
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "torch", "transformers")
 
-_SECONDS_PER_MEGAPIXEL = 0.1  # on one core, decoding included
-_REPLIES_PER_MINUTE = 20  # of a vision-language model, one at a time: a guess, since the server is unknown
+_SECONDS_PER_MEGAPIXEL = 0.1  # on one core, including decoding
+_REPLIES_PER_MINUTE = 20  # from a vision-language model, per connection: a guess, since the server is unknown
 
 
 def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
-    """The folder of the vision-language model, where one runs in process."""
+    """Return the folder of the vision-language model, if it runs in this process."""
     if config.evaluator == "qwen3-vl" and config.qwen.model_dir:
         return {"vlm": Path(config.qwen.model_dir).expanduser().absolute()}
     return {}
 
 
 def preflight(config: RvaConfig) -> None:
-    """The evaluator: raises InputError where the server does not answer or lacks the model, or the folder
-    holds none that can be loaded.
+    """Check the evaluator.
+
+    Raises:
+        InputError: if the server does not answer or does not have the model, or if the model in the folder
+            cannot be loaded.
     """
     from cleargs.rva.evaluators import check_evaluator
 
@@ -44,7 +47,7 @@ def preflight(config: RvaConfig) -> None:
 
 
 def estimate(context: StageContext[RvaConfig]) -> Estimate:
-    """Cues take nearly all of the time; memory is a handful of images a thread, and a model in process."""
+    """Estimate the cost: time for the cues, and memory for a few images per thread and for the model."""
     from .cost import capture_size
 
     config = context.config
@@ -60,10 +63,10 @@ def estimate(context: StageContext[RvaConfig]) -> Estimate:
 
 
 def run(context: StageContext[RvaConfig]) -> StageResult:
-    """Cues -> R and B -> geometric utility -> roles -> coverage -> weights; writes the two tables.
+    """Compute cues, then R and B, geometric utility, roles, coverage and weights, and write both tables.
 
-    A frame that the evaluator could not score is treated like one without a pose: it is in no set, weighs 0,
-    and the stage is done only in part.
+    A frame that the evaluator could not score is treated like a frame without a pose: it is in no set
+    and has weight 0. The result of the stage is then partial.
     """
     import numpy as np
 
@@ -95,7 +98,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     figures = summary(result, label(evaluator))
     if figures["stand_in"]:
         context.reporter.warn(
-            "no frame is reliable: the best by R - B stand in for the reliable set in the geometry"
+            "no frame is reliable; the best frames by R - B replace reliable frames in the geometric utility"
         )
     missing = tuple(
         f"frame {frame.frame_id} ({frame.name}) was not scored"

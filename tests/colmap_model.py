@@ -1,4 +1,4 @@
-"""What ``ingest`` and a training note beside frames and scenes, for runs that tests make by hand."""
+"""Sparse models and formation tables for hand-made runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POINTS_XYZ = np.random.default_rng(0).uniform([-0.5, -0.3, 1.8], [0.5, 0.3, 2.2]
 
 
 def write_sparse(ingest: Path) -> None:
-    """Twelve points, seen by every placed frame, as COLMAP model and as table."""
+    """Write twelve points, which all placed frames see, as COLMAP model and as table."""
     ids = np.arange(len(POINTS_XYZ), dtype=np.int64)
     cameras, images = {}, {}
     for frame in load_frames(ingest):
@@ -45,5 +45,5 @@ def write_sparse(ingest: Path) -> None:
 
 
 def write_no_formation(stage: Path) -> None:
-    """A ``formation.parquet`` of a training that found no frame moved."""
+    """Write the ``formation.parquet`` of a training that found no motion."""
     write_table(stage / "formation.parquet", pa.Table.from_pylist([], FORMATION), FORMATION)

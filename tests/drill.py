@@ -1,9 +1,8 @@
-"""All five stages and ``gc`` killed again and again; the results are those of an undisturbed run.
+"""Kill all five stages and ``gc`` many times, and check that the results are those of an undisturbed run.
 
-``python tests/drill.py --kills 50`` works on a synthetic capture of eight tiny frames. Each
-stage and ``gc`` get an equal share of the kills, SIGKILL at a random moment of their work; every third time
-``gc`` is started beside a stage. Programs are forked from one that has everything imported, so that a kill
-costs no start of Python.
+``python tests/drill.py --kills 50`` uses a synthetic capture of eight tiny frames. The kills are divided
+equally among the stages and ``gc``. Each is a SIGKILL at a random moment. For every third kill, ``gc`` runs
+at the same time as the stage. Programs are forked from a process that has done all imports, which saves time.
 """
 
 from __future__ import annotations
@@ -35,12 +34,12 @@ SETTINGS = {
 }
 HEAVY = ("torch", "numba", "pyarrow.parquet", "cv2", "OpenImageIO", "onnxruntime", "scipy.ndimage")
 MAX_SECONDS = 3600.0
-"""When a program counts as hung: far beyond what a busy machine needs."""
+"""Time after which a program counts as hung, far longer than a busy machine needs."""
 
 
 @dataclass
 class Drill:
-    """What is killed, and how often it was."""
+    """The run that is killed, and the number of kills per program."""
 
     root: Path
     chance: random.Random
@@ -60,17 +59,17 @@ class Drill:
         return Program(arguments, self.root / "gc.log")
 
     def kill_stage(self, stage: str, seconds: float) -> float:
-        """One kill inside ``stage``, within ``seconds`` of its start; returns within which time next.
+        """Kill ``stage`` within ``seconds`` of its start, and return the time limit for the next kill.
 
-        Where it was faster than that, its result is taken away, so that there is work again.
+        If the stage finished earlier, its result is deleted, so that it runs again.
         """
         program = self.run(self.run_folder, "--until", stage)
-        program.wait_for(f"{stage}: starts")
+        program.wait_for(f"{stage}: started")
         time.sleep(self.chance.uniform(0, seconds))
         if self.kills[stage] % 3 == 0:
-            beside = self.collect()  # refused while the stage is at work, whatever becomes of it afterwards
+            collector = self.collect()  # refused while the stage is running
             self.kills[stage] += program.kill()
-            beside.wait_for_end()
+            collector.wait_for_end()
         else:
             self.kills[stage] += program.kill()
         if not (self.run_folder / stage).is_symlink():
@@ -80,21 +79,21 @@ class Drill:
         return 0.7 * seconds
 
     def kill_gc(self, seconds: float) -> None:
-        """One kill inside a ``gc`` that has as much to remove as the run shows."""
+        """Kill a ``gc`` that has one unused result per stage to remove."""
         self.plant_garbage()
         program = self.collect(*(["--checkpoints"] if self.kills["gc"] % 2 else []))
         time.sleep(self.chance.uniform(0, seconds))
         self.kills["gc"] += program.kill()
 
     def plant_garbage(self) -> None:
-        """Results that no run links to: those of the run under other keys."""
+        """Add results that no run links to: copies of the run's results under other keys."""
         for stage in STAGES:
             shown = (self.run_folder / stage).resolve()
             shutil.copytree(shown, shown.with_name(f"{self.chance.getrandbits(256):064x}"))
 
 
 class Program:
-    """``cleargs ARGUMENTS...`` in a process of its own, which leads its group."""
+    """``cleargs ARGUMENTS...`` in a separate process, which leads its process group."""
 
     def __init__(self, arguments: Sequence[str], log: Path) -> None:
         self.arguments, self.log = list(arguments), log
@@ -120,36 +119,36 @@ class Program:
         return self.code is not None
 
     def wait_for(self, line: str) -> None:
-        """Until the program says ``line``, or ends. Raises TimeoutError when it does neither for an hour."""
+        """Wait until the program prints ``line`` or ends. Raises TimeoutError after an hour."""
         deadline = time.monotonic() + MAX_SECONDS
         while not self.ended() and line not in self.log.read_text():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{self.arguments} never said {line!r}")
+                raise TimeoutError(f"{self.arguments} did not print {line!r}")
             time.sleep(0.01)
 
     def kill(self) -> bool:
-        """SIGKILL to the program alone: its children have to notice. False when it had ended before."""
+        """Send SIGKILL to the program, but not to its children. Return False if it had ended before."""
         alive = not self.ended()
         if alive:
             os.kill(self.pid, SIGKILL)
             self.code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
-        said = self.log.read_text()
-        if "unexpected" in said or "Traceback" in said:
-            raise AssertionError(f"{self.arguments} said:\n{said}")
+        output = self.log.read_text()
+        if "unexpected" in output or "Traceback" in output:
+            raise AssertionError(f"{self.arguments} printed:\n{output}")
         return alive and self.code == -SIGKILL
 
     def wait_for_end(self) -> None:
         self.wait_for("\0")
 
     def succeed(self) -> None:
-        """Wait for its end. Raises AssertionError when it fails."""
+        """Wait for the end of the program. Raises AssertionError if it fails."""
         self.wait_for_end()
         if self.code:
             raise AssertionError(f"{self.arguments} ended with {self.code}:\n{self.log.read_text()}")
 
 
 def digests(run: Path) -> dict[str, dict[str, str]]:
-    """Stage -> file -> digest, as its manifest has them."""
+    """Stage -> file -> digest, from the manifests."""
     manifests = {stage: json.loads((run / stage / "manifest.json").read_bytes()) for stage in STAGES}
     return {
         stage: {name: record["digest"] for name, record in manifest["files"].items()}
@@ -158,17 +157,18 @@ def digests(run: Path) -> dict[str, dict[str, str]]:
 
 
 def drill(root: Path, kills: int, seed: int) -> dict[str, int]:
-    """Kill, finish, compare; returns how often each program was killed at work.
+    """Kill and finish each program, compare the results, and return the number of kills per program.
 
-    Raises AssertionError when the results differ, or a program ends as it must not.
+    Raises AssertionError if the results differ, or if a program fails.
     """
     for module in (*HEAVY, *(f"cleargs.stages.{stage}" for stage in STAGES)):
         import_module(module)
     this = Drill(root, random.Random(seed))
     synth = ["synth", str(root / "capture"), "--protocol", "mixed", "--frames", "8", "--size", "96x54"]
-    Program(synth, root / "log").succeed()  # in a process of its own: whoever forks must have no threads
+    # In a separate process, since this one forks and must have no threads.
+    Program(synth, root / "log").succeed()
     this.run(root / "undisturbed").succeed()
-    healthy = digests(root / "undisturbed")
+    expected = digests(root / "undisturbed")
     shares = {name: kills // 6 + (number < kills % 6) for number, name in enumerate(this.kills)}
     for stage in STAGES:
         seconds = json.loads((root / "undisturbed" / stage / "manifest.json").read_bytes())["seconds"]
@@ -176,7 +176,7 @@ def drill(root: Path, kills: int, seed: int) -> dict[str, int]:
             seconds = this.kill_stage(stage, seconds)
         this.run(this.run_folder, "--until", stage).succeed()
         print(f"{stage}: {this.kills[stage]} kills", flush=True)
-    assert digests(this.run_folder) == healthy, "the results differ from those of the undisturbed run"
+    assert digests(this.run_folder) == expected, "the results differ from those of the undisturbed run"
     this.plant_garbage()
     started = time.monotonic()
     this.collect().succeed()
@@ -190,7 +190,7 @@ def drill(root: Path, kills: int, seed: int) -> dict[str, int]:
         left = [folder.name for folder in (this.run_folder / ".store" / stage).iterdir()]
         assert left == [(this.run_folder / stage).resolve().name], f"gc left {left}"
     Program(["verify", str(this.run_folder)], root / "log").succeed()
-    assert digests(this.run_folder) == healthy, "gc took something that the run shows"
+    assert digests(this.run_folder) == expected, "gc removed a result of the run"
     return this.kills
 
 

@@ -1,4 +1,4 @@
-"""Whether an installation is whole: `make test-package` runs this in the environment of the wheel."""
+"""Check that an installation is complete. `make test-package` runs this in the environment of the wheel."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ for package, name in FOLDERS.items():
         assert (folder / inside).is_file(), f"{package} lacks {inside}"
 assert find_spec("tools") is None and find_spec("benchmarks") is None
 assert version("cleargs") == cleargs.__version__, version("cleargs")
-print(f"cleargs {cleargs.__version__} is whole in {files('cleargs')}")
+print(f"cleargs {cleargs.__version__} is complete in {files('cleargs')}")

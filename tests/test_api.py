@@ -1,4 +1,4 @@
-"""The library: its names, and what they do on a run."""
+"""The Python API: its names, its imports and its errors."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def test_former_names_give_the_present_object_and_a_warning() -> None:
             assert getattr(cg, former) is getattr(cg, present)
 
 
-def test_the_import_brings_nothing_heavy() -> None:
-    """Neither `import cleargs` nor reading a run's tables loads what computes."""
+def test_the_import_loads_nothing_heavy() -> None:
+    """Neither `import cleargs` nor reading the tables of a run imports heavy libraries."""
     code = (
         "import sys, cleargs as cg; assert not {'numpy', 'pydantic', 'torch'} & set(sys.modules);"
         "cg.run, cg.open_run, cg.Run;"
@@ -58,8 +58,8 @@ def test_training_needs_no_capture_libraries() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_what_is_missing_is_an_error_with_a_hint(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is no run"):
+def test_a_missing_run_or_stage_is_an_error_with_a_hint(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is not a run"):
         cg.open_run(tmp_path)
     with pytest.raises(InputError, match="there is no stage"):
         cg.Run(tmp_path)["rvaa"]

@@ -1,4 +1,4 @@
-"""The kill drill over all five stages and ``gc``, at its shortest: one kill each."""
+"""The shortest kill drill: one kill of each of the five stages and ``gc``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All five stages on a small synthetic capture, through the command line, as a user runs them."""
+"""All five stages on a small synthetic capture, from the command line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ KILLS_PER_STAGE = 2
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight frames, images alone: half of them sharp."""
+    """Eight frames without poses, half of them sharp."""
     folder = tmp_path_factory.mktemp("capture") / "room"
     make_capture(folder, "mixed", frames=8, width=320, height=180, seed=3, reporter=SilentReporter())
     return folder
@@ -55,7 +55,7 @@ def finish(capture: Path, run: Path, *more: str) -> subprocess.CompletedProcess[
 
 
 def digests(run: Path) -> dict[str, dict[str, str]]:
-    """Stage -> file -> digest, as its manifest has them."""
+    """Stage -> file -> digest, from the manifests."""
     manifests = {stage: json.loads((run / stage / "manifest.json").read_text()) for stage in STAGES}
     return {
         stage: {name: record["digest"] for name, record in manifest["files"].items()}
@@ -78,7 +78,7 @@ def test_every_artifact_is_there_to_inspect(finished: Path) -> None:
     rva = pq.read_table(finished / "rva" / "frames.parquet").to_pylist()
     assert len(rva) == 8 and any(row["weight"] > 0.8 for row in rva)
     selection = pq.read_table(finished / "rivr" / "selection.parquet").to_pylist()
-    # One strong frame is held back from distillation to tell whether it did harm.
+    # One strong frame is not repaired: it is the judge of harm.
     targets = sum(frame["registered"] for frame in frames) - 1
     assert len(selection) == 2 * targets
     for row in selection:
@@ -99,7 +99,7 @@ def test_one_thread_gives_the_same_digests(capture: Path, finished: Path, tmp_pa
 def test_the_same_command_again_does_nothing(capture: Path, finished: Path) -> None:
     before = _times(finished)
     done = finish(capture, finished)
-    assert all(f"{stage}: starts" not in done.stderr for stage in STAGES)
+    assert all(f"{stage}: started" not in done.stderr for stage in STAGES)
     after = _times(finished)
     assert {path: after.get(path) for path in before} == before
 
@@ -112,7 +112,7 @@ def test_a_setting_redoes_only_what_reads_it(capture: Path, finished: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
-def test_killed_at_any_moment_it_ends_with_the_same_digests(
+def test_a_killed_stage_ends_with_the_same_digests(
     stage: str, capture: Path, finished: Path, tmp_path: Path
 ) -> None:
     """kill -9 at random moments inside the stage, then the same command."""
@@ -121,14 +121,16 @@ def test_killed_at_any_moment_it_ends_with_the_same_digests(
     seconds = json.loads((finished / stage / "manifest.json").read_text())["seconds"]
     moments = random.Random(stage)
     for _ in range(KILLS_PER_STAGE):
-        _kill_inside(command(capture, run, "--until", stage), f"{stage}: starts", moments.uniform(0, seconds))
+        _kill_inside(
+            command(capture, run, "--until", stage), f"{stage}: started", moments.uniform(0, seconds)
+        )
     finish(capture, run, "--until", stage)
     files = json.loads((run / stage / "manifest.json").read_text())["files"]
     assert {name: record["digest"] for name, record in files.items()} == digests(finished)[stage]
 
 
 def _copy_before(stage: str, finished: Path, run: Path) -> None:
-    """A copy of the finished run in which ``stage`` and those behind it were never made."""
+    """Copy the finished run without the results of ``stage`` and of later stages."""
     shutil.copytree(finished, run, symlinks=True)
     for later in STAGES[STAGES.index(stage) :]:
         (run / later).unlink()
@@ -137,14 +139,14 @@ def _copy_before(stage: str, finished: Path, run: Path) -> None:
 
 
 def _times(run: Path) -> dict[Path, int]:
-    """When each file was last written; a lock names its holder, and reading may fill the memo of digests."""
-    passing = (".lock", "digests.sqlite")
-    files = (path for path in run.rglob("*") if path.is_file() and not path.name.startswith(passing))
+    """Time of the last change of each file, except locks and the memo of digests, which any run may write."""
+    ignored = (".lock", "digests.sqlite")
+    files = (path for path in run.rglob("*") if path.is_file() and not path.name.startswith(ignored))
     return {path: path.stat().st_mtime_ns for path in files}
 
 
 def _kill_inside(arguments: list[str], start: str, delay: float) -> None:
-    """Start the command, wait for the line ``start``, then ``delay`` seconds, then kill -9 all of it."""
+    """Start the command, wait for the line ``start`` and ``delay`` seconds, then kill its process group."""
     with subprocess.Popen(
         arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
@@ -156,4 +158,4 @@ def _kill_inside(arguments: list[str], start: str, delay: float) -> None:
         try:
             os.killpg(process.pid, signal.SIGKILL)
         except ProcessLookupError:
-            return  # it was faster than that
+            return  # it had ended before

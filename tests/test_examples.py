@@ -1,11 +1,13 @@
-"""All examples run unchanged on a tiny capture."""
+"""The examples of the folder ``examples`` and of the docstrings run on a tiny capture."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import runpy
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
@@ -32,12 +34,39 @@ distil.steps = 5
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a folder with a capture of eight frames, a recipe and a run."""
+    """A folder with a capture of eight frames, a recipe and a run."""
     folder = tmp_path_factory.mktemp("examples")
     make_capture(folder / "room", "mixed", frames=8, width=96, height=54, seed=0, reporter=SilentReporter())
     (folder / "tiny.toml").write_text(TINY)
     cg.run(folder / "room", folder / "run", workflow=str(folder / "tiny.toml"))
     return folder
+
+
+def docstring_examples() -> dict[str, str]:
+    """Name of a public function or method -> code of its section ``Example:``."""
+    found = {}
+    for name in cg.__all__:
+        public = getattr(cg, name)
+        methods = vars(public).values() if inspect.isclass(public) else ()
+        for function in (public, *filter(inspect.isfunction, methods)):
+            _, section, code = (inspect.getdoc(function) or "").partition("Example:\n")
+            if section:
+                found[function.__qualname__] = dedent(code)
+    return found
+
+
+DOCSTRING_EXAMPLES = docstring_examples()
+
+
+def test_every_public_function_has_an_example() -> None:
+    functions = {name for name in cg.__all__ if inspect.isfunction(getattr(cg, name))}
+    assert functions and functions <= DOCSTRING_EXAMPLES.keys()
+
+
+@pytest.mark.parametrize("name", DOCSTRING_EXAMPLES)
+def test_examples_of_docstrings(name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    exec(DOCSTRING_EXAMPLES[name], {"cg": cg})
 
 
 def example(
@@ -88,7 +117,7 @@ def test_evaluate_scenes(
 
 
 def test_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs the cells one after the other, without Jupyter."""
+    """Run all cells in order, without Jupyter."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
     notebook = json.loads((EXAMPLES / "walkthrough.ipynb").read_text())
     code = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]

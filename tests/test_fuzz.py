@@ -1,7 +1,7 @@
-"""Readers under mutated files: whatever comes, they return or raise an error of one line, and soon.
+"""Readers of mutated files: they either return or raise an error of one line, in a short time.
 
-The same 60 mutations a reader in each run of the tests. ``make fuzz SEED=7`` draws 2000 others of each;
-the same seed draws the same again.
+A run of the tests uses the same 60 mutations per reader. ``make fuzz SEED=7`` draws 2000 mutations per
+reader, which depend only on the seed.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ INTERESTING = [
 
 @st.composite
 def mutations(draw: st.DrawFn) -> Callable[[bytes], bytes]:
-    """A few edits: bytes flipped, pieces cut, doubled or replaced by something of interest."""
+    """A few edits: bytes are flipped, or parts are cut, doubled or replaced by an interesting value."""
     edits = draw(
         st.lists(
             st.tuples(
@@ -93,7 +93,7 @@ def mutations(draw: st.DrawFn) -> Callable[[bytes], bytes]:
 
 
 def _number(data: bytes, at: int, piece: bytes) -> bytes:
-    """The next number in a text replaced."""
+    """Replace the next number in a text."""
     start = next((k for k in range(at, len(data)) if 48 <= data[k] < 58), len(data))
     end = next((k for k in range(start, len(data)) if data[k] not in b"0123456789.eE+-"), len(data))
     return data[:start] + piece + data[end:]
@@ -212,7 +212,7 @@ def video(folder: Path) -> None:
 
 
 def read_manifest_or_none(folder: Path) -> object:
-    with suppress(ValueError, FileNotFoundError):  # what its callers take for damage
+    with suppress(ValueError, FileNotFoundError):  # its callers treat these as damage
         return read_manifest(folder)
     return None
 

@@ -17,7 +17,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cleargs.formation", "cleargs.rva"),
     ("cleargs.rivr", "cleargs.evaluate", "cleargs.synth"),
     ("cleargs.pipeline",),
-    ("cleargs.run_results",),  # what a finished run holds, read back
+    ("cleargs.run_results",),  # reads the results of a finished run
     ("cleargs.report", "cleargs.render"),
     ("cleargs.api",),
     ("cleargs.stages", "cleargs.workflows"),
@@ -27,7 +27,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 """Packages from the bottom up. A module belongs to the longest name that it starts with."""
 
 PIPELINE = "cleargs.pipeline"
-"""It knows stages by a protocol alone, so it imports root modules only."""
+"""The package that knows stages only by a protocol, so it imports only root modules."""
 
 
 def modules() -> dict[str, Path]:
@@ -42,7 +42,7 @@ def modules() -> dict[str, Path]:
 
 
 def imports(path: Path, known: Mapping[str, Path]) -> set[str]:
-    """Modules of ours that a file imports, also inside functions and for type checking."""
+    """Modules of ClearGS that a file imports, also inside functions and for type checking."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
@@ -115,7 +115,7 @@ def test_no_import_cycle() -> None:
 
 
 def test_a_cycle_is_named() -> None:
-    """The check itself: a circle of three and an import that climbs are found."""
+    """The checks find a cycle of three modules, and an import from a higher layer."""
     circle = {"cleargs.splat.a": {"cleargs.splat.b"}, "cleargs.splat.b": {"cleargs.splat.c"}}
     circle |= {"cleargs.splat.c": {"cleargs.splat.a"}, "cleargs.media.d": {"cleargs.splat.a"}}
     assert cycles(circle) == [["cleargs.splat.a", "cleargs.splat.b", "cleargs.splat.c"]]

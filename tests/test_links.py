@@ -1,4 +1,4 @@
-"""Links that `make docs` does not see: those of pages outside docs/, and pages that the source names."""
+"""Links that `make docs` does not check: those of pages outside docs/, and names of pages in the source."""
 
 from __future__ import annotations
 

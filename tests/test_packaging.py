@@ -1,4 +1,4 @@
-"""What gets installed is what lies in the checkout."""
+"""Packages, versions and dependencies of an installation."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def test_wheel_imports_nothing_of_the_checkout() -> None:
             assert not [name for name in names if name.split(".")[0] in CHECKOUT_ALONE], path
 
 
-def test_the_version_stands_in_one_place() -> None:
-    """``cleargs.__version__``; the metadata of the installation and the citation follow it."""
+def test_the_version_is_the_same_everywhere() -> None:
+    """``cleargs.__version__``, the metadata of the installation, the citation and the changelog agree."""
     assert version("cleargs") == cleargs.__version__
     cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     assert cited is not None and cited[1] == cleargs.__version__
@@ -49,7 +49,7 @@ def test_the_version_stands_in_one_place() -> None:
 
 
 def test_every_dependency_is_pinned() -> None:
-    """The lock names all that an installation brings, the dependencies of dependencies too, with digests."""
+    """The lock lists all packages of an installation, including indirect dependencies, with digests."""
     lock = (ROOT / "requirements.lock").read_text()
     pins = re.findall(r"^(\S+)==[^\\\n]*((?: \\\n    --hash=sha256:[0-9a-f]{64})+)$", lock, re.MULTILINE)
     assert len(pins) == sum(bool(line) and line[0] not in "# " for line in lock.splitlines())
@@ -59,7 +59,7 @@ def test_every_dependency_is_pinned() -> None:
 
 
 def test_the_versions_here_are_those_of_the_lock() -> None:
-    """What CI tests is what the lock installs."""
+    """CI tests the versions that the lock installs."""
     shared = (ROOT / "requirements.lock").read_text().split("\n## cuda ")[0]
     locked = dict(re.findall(r"^(\S+)==([^\s;]+)", shared, re.MULTILINE))
     here = {name: version(name) for name in needed("cleargs", ("test",)) if name in locked}
@@ -67,11 +67,11 @@ def test_the_versions_here_are_those_of_the_lock() -> None:
 
 
 LEFT_OPEN = ("pip", "torch", "nvidia-", "cuda-", "triton")
-"""What builds of torch bring, torch itself (constraints.txt), and pip."""
+"""Packages that the lock leaves out: pip, torch (see constraints.txt) and its dependencies."""
 
 
 def needed(distribution: str, extras: tuple[str, ...] = ()) -> set[str]:
-    """All that ``distribution`` with ``extras`` needs here, directly or not, by normal names."""
+    """Normalised names of the direct and indirect dependencies of ``distribution`` on this platform."""
     found: set[str] = set()
     waiting = [(distribution, extras)]
     seen = set()

@@ -1,4 +1,4 @@
-"""Parts of another package, that of the examples: found by name, refused by name, in the keys."""
+"""Plugins: the package of the examples is found by name, and its version enters the keys."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PARTS = Path(__file__).parents[1] / "examples" / "parts"
 
 
 def install(folder: Path, version: str = "1.0") -> None:
-    """Lay down what `pip install examples/parts` would, in ``folder``."""
+    """Write the metadata that `pip install examples/parts` would write, into ``folder``."""
     project = tomllib.loads((PARTS / "pyproject.toml").read_text())["project"]
     information = folder / "cleargs_parts.dist-info"
     information.mkdir(exist_ok=True)
@@ -43,12 +43,12 @@ def install(folder: Path, version: str = "1.0") -> None:
 
 @pytest.fixture
 def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The example's package, installed for one test."""
+    """The package of the examples, installed for one test."""
     folder = tmp_path / "site-packages"
     folder.mkdir()
     install(folder)
-    for place in (folder, PARTS):
-        monkeypatch.syspath_prepend(str(place))
+    for path in (folder, PARTS):
+        monkeypatch.syspath_prepend(str(path))
     return folder
 
 
@@ -98,12 +98,12 @@ def test_the_version_of_the_package_is_in_the_key(parts: Path) -> None:
     }
     install(parts, "1.1")
     assert plugin_versions(sections["rva"]) == {"cleargs-parts for evaluator=contrast": "1.1"}
-    for stage in ("rivr", "consolidate"):  # no file stands for a part of another package
+    for stage in ("rivr", "consolidate"):  # a plugin has no file outside the store
         roles = installed().load(stage).externals(sections[stage], Path())
         assert "tie-break scorer" not in roles and roles
 
 
-def test_a_broken_part_is_an_error_with_a_remedy(parts: Path) -> None:
+def test_a_broken_plugin_is_an_error_with_a_hint(parts: Path) -> None:
     entries = parts / "cleargs_parts.dist-info" / "entry_points.txt"
     entries.write_text("[cleargs.experts]\nunsharp = cleargs_parts.nowhere:Expert\n")
     with pytest.raises(InputError, match=r"unsharp of cleargs-parts 1\.0 cannot be loaded") as caught:
@@ -128,7 +128,7 @@ def test_expert_and_scorer(parts: Path, picture: np.ndarray) -> None:
     assert restored.shape == picture.shape and np.abs(restored - picture).mean() > 0.01
     assert 0.0 < cg.score(0.5 * picture, scorer="gradient") <= 100.0
     assert cg.score(np.full_like(picture, 0.5), scorer="gradient") == 0.0
-    # No part shadows what ships.
+    # A plugin cannot replace a part of ClearGS.
     assert load_expert("embedded").name == "embedded"
 
 
@@ -139,7 +139,7 @@ def test_format(parts: Path, tmp_path: Path) -> None:
     x, y, z = scene.gaussians.means[0].tolist()
     assert lines[0] == "x,y,z" and len(lines) == 1 + scene.gaussians.num
     assert [float(value) for value in lines[1].split(",")] == pytest.approx([x, -y, -z], rel=1e-5)
-    with pytest.raises(InputError, match="no ending") as caught:
+    with pytest.raises(InputError, match="not a known scene format") as caught:
         cg.save(scene, tmp_path / "room.xyz")
     assert ".csv" in caught.value.hint and ".ply" in caught.value.hint
 
@@ -172,7 +172,7 @@ def toy_views(scene: Scene, dim: float = 0.0) -> list[TrainingView]:
 
 
 def test_formation(parts: Path) -> None:
-    """The example's vignette is found while the scene is trained through it."""
+    """The training fits the strength of the vignette in the example."""
     from cleargs_parts.formation import Vignette
 
     scene, vignette = toy(), Vignette(rate=0.5)

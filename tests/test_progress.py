@@ -1,4 +1,4 @@
-"""What a progress bar says of the speed, and of the time that is left."""
+"""Speed and remaining time of tasks, and the reporter of the library."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cleargs.progress import CountedTask, Rate, log_reporter
 
 
 def test_the_rate_is_that_of_the_last_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A training that slows down from ten steps a second to one: the mean would say 2.5 at its end."""
+    """A training slows down from 10 steps per second to 1. Its mean would be 2.5 at the end."""
     now, done = 1000.0, 0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
     rate = Rate()
@@ -40,8 +40,8 @@ def test_a_rate_changes_within_twice_its_seconds(monkeypatch: pytest.MonkeyPatch
     assert shown[40 + settled :] == [2.0] * (40 - settled)
 
 
-def test_no_less_than_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shares of work are sums, which end at 1 but for rounding: the bar said "-0 s left"."""
+def test_the_remaining_time_is_never_negative(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares of work are sums, which may end slightly above 1. The bar then showed "-0 s left"."""
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
     shown: list[float | None] = []
@@ -79,15 +79,15 @@ def test_a_run_of_the_library_logs(
     (tmp_path / "photos").mkdir()
     caplog.set_level(logging.INFO, "cleargs")
 
-    def asked(*arguments: object, say: Callable[[str], None], **options: object) -> None:
+    def resolve(*arguments: object, say: Callable[[str], None], **options: object) -> None:
         say("as in run.toml")
         raise InputError("stop", hint="here")
 
-    monkeypatch.setattr(api, "resolve_run", asked)
+    monkeypatch.setattr(api, "resolve_run", resolve)
     with pytest.raises(InputError):
         api.run(tmp_path / "photos", tmp_path / "run")
     assert caplog.messages == ["as in run.toml"]
     lines: list[str] = []
     with pytest.raises(InputError):
         api.run(tmp_path / "photos", tmp_path / "run", progress=lines.append)
-    assert lines == ["as in run.toml"] and caplog.messages == lines, "a function takes them in its place"
+    assert lines == ["as in run.toml"] and caplog.messages == lines, "the function replaces the logger"

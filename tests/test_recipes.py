@@ -1,4 +1,4 @@
-"""The paper's method as a recipe: every setting that makes it the paper's, and no run without its models."""
+"""The recipes of the paper's method: their settings, and their need for models."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ METHOD: dict[str, Any] = {
     "rva.enabled": True,
     "rva.weighting": "graded",
     "rva.coverage": True,
-    "rva.active_share": 0.0,  # what the rules suppress stays suppressed
+    "rva.active_share": 0.0,  # suppressed frames stay suppressed
     "rivr.targets": "all",
     "rivr.harm.held_back": 0.0,  # every frame is a target, no veto
     "rivr.group": 8,  # along the trajectory
@@ -41,7 +41,7 @@ METHOD: dict[str, Any] = {
     "consolidate.distil.pseudo_share": "even",
     "consolidate.distil.pseudo_weight": 1.0,
 }
-"""What both recipes must say, whatever the defaults become."""
+"""Settings that both recipes must have, whatever the defaults are."""
 
 TABLE: dict[str, Any] = {
     "rva.w_R": (0.30, 0.25, 0.20, 0.15, 0.10),
@@ -100,8 +100,9 @@ def test_the_paper_has_as_many_gaussians_as_its_field() -> None:
 
 
 def test_the_open_row_trains_as_the_default_does() -> None:
-    """Frames, poses, trainer and steps alike, so that the table compares methods. Formation is none of the
-    paper's.
+    """Frames, poses, trainer and steps are equal, so that the table compares methods.
+
+    Image formation is not a part of the paper's method.
     """
     off = {"formation": FormationConfig(enabled=False)}
     default, row = load_config(installed(), "default"), load_config(installed(), "paper-open")
@@ -178,10 +179,10 @@ EMBEDDED = {
         ("default", "rivr.expert=none.onnx", "none.onnx", "check the path"),
     ],
 )
-def test_a_missing_model_is_said_before_any_work(
+def test_a_missing_model_is_an_error_before_any_work(
     bare: Path, capsys: pytest.CaptureFixture[str], recipe: str, kept: str, cause: str, remedy: str
 ) -> None:
-    """Each alone: the others are those that ship."""
+    """Only one model is missing. The others are those of ClearGS."""
     name, _, _ = kept.partition("=")
     settings = [f"{other}={model}" for other, model in EMBEDDED.items() if other != name]
     settings += [kept] if "=" in kept else []
@@ -193,7 +194,7 @@ def test_a_missing_model_is_said_before_any_work(
     assert not (bare / "run" / "ingest").exists()
 
 
-def test_a_damaged_model_is_said_before_any_work(bare: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_model_is_an_error_before_any_work(bare: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (bare / "models").mkdir()
     (bare / "models" / "nafnet-gopro.onnx").write_bytes(b"cut off")
     arguments = ["run", str(bare / "photos"), "-o", str(bare / "run"), "--workflow", "paper-open"]
@@ -213,7 +214,7 @@ def test_a_share_is_a_number_or_even(share: str) -> None:
     [
         (200, {"data": [{"id": "Qwen/Qwen3-VL-8B-Instruct"}]}, None),
         (200, {"data": [{"id": "llama"}]}, "has no model Qwen/Qwen3-VL-8B-Instruct; it has llama"),
-        (200, {"data": []}, None),  # it lists none: the first frame will tell
+        (200, {"data": []}, None),  # it lists no model, so the first frame decides
         (200, "models", None),
         (404, {}, None),
         (401, {}, "refuses the key"),
@@ -240,10 +241,10 @@ def test_the_server_must_have_the_model(status: int, body: Any, cause: str | Non
         thread.join()
 
 
-def test_a_folder_without_a_model_is_said_before_any_work(tmp_path: Path) -> None:
+def test_a_folder_without_a_model_is_an_error(tmp_path: Path) -> None:
     pytest.importorskip("transformers", reason="the extra vlm is not installed")
     settings = ["rva.qwen.model=", f"rva.qwen.model_dir={tmp_path}"]
     config = load_config(installed(), "paper", settings).sections["rva"]
     assert isinstance(config, RvaConfig)
-    with pytest.raises(InputError, match="holds no Qwen3-VL model"):
+    with pytest.raises(InputError, match="cannot load a Qwen3-VL model"):
         check_evaluator(config)

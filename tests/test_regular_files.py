@@ -1,4 +1,4 @@
-"""Documents that lie where anybody may put them: no pipe holds a reader up, no depth of nesting ends it."""
+"""Untrusted documents: a pipe does not block their readers, and deep nesting does not crash them."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("what", ["a pipe", "nested deeply"])
-def test_what_nobody_trusts_is_refused_or_passed_over(name: str, what: str, tmp_path: Path) -> None:
-    place, read = READERS[name]
-    file = tmp_path / place
+def test_an_untrusted_file_is_refused_or_ignored(name: str, what: str, tmp_path: Path) -> None:
+    relative, read = READERS[name]
+    file = tmp_path / relative
     file.parent.mkdir(exist_ok=True)
     if what == "a pipe":
         os.mkfifo(file)

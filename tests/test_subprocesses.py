@@ -1,4 +1,4 @@
-"""Child processes never import what lies in the working folder."""
+"""Child processes never import modules from the working folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HOSTILE = ["pycolmap.py", "json.py", "numpy.py", "cleargs/__init__.py"]
 
 @pytest.fixture
 def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Path:
-    """A working folder with a module that leaves a mark when it is imported; returns the mark."""
+    """A working folder with a module that creates a file when it is imported; the path of that file."""
     mark = tmp_path / "imported"
     module = tmp_path / "capture" / request.param
     module.parent.mkdir(parents=True)
@@ -28,7 +28,7 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixtur
 
 @pytest.mark.parametrize("trap", HOSTILE, indirect=True)
 def test_children_import_nothing_from_the_working_folder(trap: Path, tmp_path: Path) -> None:
-    with pytest.raises(StageError):  # there is no such job, which the child only finds out when it runs
+    with pytest.raises(StageError):  # the job does not exist, which the child notices after its imports
         run_child("cleargs.capture.sfm_worker", tmp_path / "no.json", tmp_path / "log", SilentReporter())
     assert "no.json" in (tmp_path / "log").read_text()
     assert not trap.exists()

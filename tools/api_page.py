@@ -6,6 +6,7 @@ import ast
 import inspect
 import re
 from collections.abc import Iterator
+from textwrap import dedent
 
 from pydantic import BaseModel
 
@@ -68,7 +69,18 @@ def _code(lines: list[str]) -> list[str]:
 
 
 def _text(found: object) -> list[str]:
-    return (inspect.getdoc(found) or "").replace("``", "`").splitlines()
+    """Return a docstring in Markdown: arguments and errors as lists, and the example as code."""
+    text = (inspect.getdoc(found) or "").replace("``", "`")
+    text, *sections = re.split(r"^(Args|Returns|Raises|Example):\n", text, flags=re.MULTILINE)
+    parts = [text.rstrip()]
+    for title, indented in zip(sections[::2], sections[1::2], strict=True):
+        body = dedent(indented).strip()
+        if title == "Example":
+            body = f"```python\n{body}\n```"
+        elif title != "Returns":
+            body = re.sub(r"^(\w+):", r"* `\1`:", body, flags=re.MULTILINE)
+        parts += [f"**{title}**", body]
+    return "\n\n".join(parts).splitlines()
 
 
 if __name__ == "__main__":

@@ -306,7 +306,7 @@ def _synthetic_capture(
             height=height,
             seed=seed,
             reporter=context.reporter,
-            setting=None if scene is None else scene_setup(scene, None, section.frames, width, height),
+            setup=None if scene is None else scene_setup(scene, None, section.frames, width, height),
         )
         partial.rename(place)
     return place

@@ -65,6 +65,6 @@ def world(
         height=height,
         seed=seed,
         reporter=make_reporter(),
-        setting=scene_setup(scene, cameras, frames, width, height),
+        setup=scene_setup(scene, cameras, frames, width, height),
     )
     print_capture(out, summary)

@@ -1,1 +1,1 @@
-"""Many scenes: the sheet that lists them, the loop that runs them, the page that shows them."""
+"""Many scenes: read a sheet of scenes, run them, and show them on a page."""

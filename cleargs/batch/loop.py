@@ -1,12 +1,12 @@
-"""The scenes of a batch one after the other, each in a process of its own; what became of each.
+"""Run the scenes of a batch one after the other, each in a separate process, and collect the results.
 
 ::
 
     BATCH/scenes/NAME/       run folders, as `cleargs run` makes them
-    BATCH/store/             one store for all scenes: captures with several settings share what they can
-    BATCH/logs/NAME.log      the output of the last try
+    BATCH/store/             one store for all scenes: equal results are shared
+    BATCH/logs/NAME.log      the output of the last attempt
     BATCH/summary.csv        one row per scene
-    BATCH/report/index.html  all scenes as a page
+    BATCH/report/index.html  a page with all scenes
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import Device, RunSpec
+from cleargs.pipeline.run_file import Device, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
@@ -36,29 +36,30 @@ from cleargs.report.report_json import linked_manifests
 from cleargs.subprocesses import module_command
 
 State = Literal["failed", "waiting", "partial", "done"]
-"""`waiting`: there are stages to make, and no try has failed."""
+"""``waiting``: stages are missing, and the last attempt, if any, reported no error."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """State and figures of one scene: a row of ``summary.csv``."""
+    """State and figures of a scene: a row of ``summary.csv``."""
 
     scene: str
     state: State
     frames: int | None
     frames_placed: int | None
     psnr_unseen: float | None
-    """Of the last scene, on pixels that no training saw, dB."""
+    """PSNR of the last scene on pixels that no training saw, in dB."""
     minutes: float
-    """Of work, all stages."""
+    """Time of all stages."""
     memory_gb: float
-    """The most that a stage took."""
+    """Peak memory of all stages, 1e9 bytes."""
     disk_gb: float
+    """Size of all results, 1e9 bytes."""
     cause: str
-    """Why it failed, or what is missing."""
+    """Cause of the failure, or missing outputs."""
 
     def figures(self) -> list[tuple[str, str]]:
-        """Return values and their meanings, as far as they are known."""
+        """Return the known figures as (value, meaning)."""
         found = []
         if self.frames is not None:
             found.append((f"{self.frames_placed} of {self.frames}", "frames placed"))
@@ -73,39 +74,44 @@ class Result:
 
 @dataclass(frozen=True)
 class Batch:
-    """The scenes of a sheet and how they are run."""
+    """The scenes of a sheet, and the options with which they run."""
 
     dag: Dag
     folder: Path
-    """Absolute."""
+    """Absolute path of the batch."""
     scenes: Sequence[SceneJob]
     device: Device
     until: str | None = None
+    """The last stage to run; None for all."""
     overrides: tuple[str, ...] = ()
-    """Settings of all scenes; those of a scene go over them."""
+    """Settings of all scenes. Those of a scene override them."""
     options: tuple[str, ...] = ()
-    """Further options of each ``cleargs run``."""
+    """More options for each ``cleargs run``."""
+    falls_back: bool = False
+    """True if ``--device auto`` chose the GPU: a scene on which its kernels fail continues on the CPU."""
 
     def run_folder(self, scene: SceneJob) -> Path:
         """Return the run folder of ``scene``."""
         return self.folder / "scenes" / scene.name
 
     def log(self, scene: SceneJob) -> Path:
-        """Return the file that holds the output of the last try."""
+        """Return the file with the output of the last attempt."""
         return self.folder / "logs" / f"{scene.name}.log"
 
     def arguments(self, scene: SceneJob) -> list[str]:
-        """Return the arguments of ``cleargs`` that bring ``scene`` through the stages."""
+        """Return the arguments of ``cleargs`` that run ``scene``."""
         settings = [word for text in (*self.overrides, *scene.overrides) for word in ("--set", text)]
         until = ["--until", self.until] if self.until else []
+        device = "auto" if self.falls_back else self.device
         return [
             *("run", str(scene.source), "-o", str(self.run_folder(scene)), "--store", str(self._store)),
-            *("--workflow", scene.recipe, *settings, *until, "--device", self.device, *self.options),
+            *("--workflow", scene.recipe, *settings, *until, "--device", device, *self.options),
         ]
 
     def check(self, sheet: Path) -> None:
-        """Raise SheetError where a scene has no input, a setting is wrong, a model is missing, or the run
-        folder belongs to another input: hours of work are not to end in a missing file.
+        """Raise SheetError if a scene cannot run, so that hours of work do not end in a missing file.
+
+        Causes are a missing input, a wrong setting, a missing model, or a run folder of another input.
         """
         problems = []
         for scene in self.scenes:
@@ -121,13 +127,13 @@ class Batch:
             raise SheetError(sheet, problems)
 
     def plan(self, scene: SceneJob) -> list[StagePlan]:
-        """Return the state of each stage. Raises CleargsError where the capture cannot be read."""
+        """Return the state of each stage. Raises CleargsError if the capture cannot be read."""
         run = self._run(scene)
         with opened_store(run.store) as store:
             return Planner(self.dag, run, store, usable_cores(), SilentReporter()).plan(self.until)
 
     def run(self, scene: SceneJob, reporter: Reporter) -> None:
-        """Run ``scene`` in a process of its own; its words go to its log and to ``reporter``."""
+        """Run ``scene`` in a separate process, and copy its output to its log and to ``reporter``."""
         log = self.log(scene)
         log.parent.mkdir(parents=True, exist_ok=True)
         command = [*program(), *self.arguments(scene)]
@@ -155,7 +161,7 @@ class Batch:
                 file.write(f"error: ended by signal {-child.returncode}\n")
 
     def result(self, scene: SceneJob) -> Result:
-        """Return what is there of ``scene``."""
+        """Return the present state and figures of ``scene``."""
         made = linked_manifests(self.run_folder(scene), self.dag.names)
         ingest = made["ingest"].summary if "ingest" in made else {}
         psnr = [manifest.summary.get("psnr_unseen") for manifest in made.values()]
@@ -184,7 +190,7 @@ class Batch:
             return ("partial", "; ".join(missing)) if missing else ("done", "")
         if unfinished.state == "partial":
             return "partial", "; ".join(unfinished.reasons)
-        with suppress(OSError):  # no try yet
+        with suppress(OSError):  # no attempt yet
             lines = self.log(scene).read_text("utf-8", "replace").splitlines()
             if errors := [line[7:] for line in lines if line.startswith("error: ")]:
                 return "failed", errors[-1]
@@ -201,7 +207,9 @@ class Batch:
             device="cpu",
             say=lambda line: None,
         )
-        return replace(run, device=self.device)  # which a login node need not have
+        before = read_metadata(run.folder) if self.falls_back else RunMetadata()
+        # The device is not checked: a login node may not have it.
+        return replace(run, device=before.device or self.device, on_cpu=before.on_cpu)
 
     @property
     def _store(self) -> Path:
@@ -209,7 +217,7 @@ class Batch:
 
 
 def program() -> list[str]:
-    """Return how ``cleargs`` is started as a child: its script need not be next to the interpreter."""
+    """Return the command that starts ``cleargs``, which does not need its script next to the interpreter."""
     return module_command("cleargs.cli.entry")
 
 

@@ -1,4 +1,4 @@
-"""``BATCH/report/index.html``: all scenes of a batch as a grid that leads to their own reports."""
+"""``BATCH/report/index.html``: a grid of all scenes with links to their reports."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from cleargs.report.page import write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 
 BYTES = 15_000_000
-"""About how much all thumbnails together may take."""
+"""Approximate limit for the size of all thumbnails together."""
 
 MAX_SIDE, MIN_SIDE = 480, 96
-"""Of a thumbnail, px."""
+"""Limits for the long side of a thumbnail, px."""
 
 ASPECT = 9 / 16
-"""Of most captures."""
+"""Aspect ratio of most captures, height / width."""
 
 
 def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
-    """Write the page, in place of an older one; return its path. Raises StoreError."""
+    """Write the page, and replace an older one. Return its path. Raises StoreError."""
     kinds: Counter[str] = Counter(result.state for result in results)
     order = get_args(State)
     pairs = sorted(zip(batch.scenes, results, strict=True), key=lambda pair: order.index(pair[1].state))
@@ -58,7 +58,7 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
 
 
 def _card(batch: Batch, scene: SceneJob, result: Result, report: Path, side: int) -> dict[str, Any]:
-    """Return what the page says of one scene; an address is "" where there is no such file."""
+    """Return the values of one scene for the template. An address is "" if there is no such file."""
     run = batch.run_folder(scene)
     made = linked_manifests(run, batch.dag.names)
     picture, shows = _picture(run, made, report, f"scenes/{scene.name}.jpg", side)
@@ -77,7 +77,7 @@ def _card(batch: Batch, scene: SceneJob, result: Result, report: Path, side: int
 def _picture(
     run: Path, made: Mapping[str, Manifest], report: Path, name: str, side: int
 ) -> tuple[ImageFile | None, str]:
-    """Return the still of the scene's report, else its first frame; and the subject of the picture."""
+    """Return a picture, and a label for it: the still of the scene's report, or else the first frame."""
     still = run / FOLDER / "after.jpg"
     try:
         if still.is_file():
@@ -85,7 +85,7 @@ def _picture(
         if "ingest" in made:
             first = load_frames(run / "ingest")[0].image
             return write_jpeg(report, name, read_rgb(run / "ingest" / first), side), "the first frame"
-    except CleargsError:  # a damaged picture is no reason to leave out the scene
+    except CleargsError:  # a damaged picture must not hide the scene
         pass
     return None, ""
 

@@ -1,4 +1,4 @@
-"""A sheet of scenes, TOML or CSV: each scene is a call of ``cleargs run``."""
+"""Read a sheet of scenes (TOML or CSV). Each scene is one call of ``cleargs run``."""
 
 from __future__ import annotations
 
@@ -18,21 +18,24 @@ from cleargs.pipeline.settings import flattened
 from cleargs.safe_io import FAULTS, cause, read_text
 
 NAMES = "letters, digits, and _ . - after the first, at most 100"
+"""Description of a valid name for a message."""
 PLAIN = ("name", "input", "recipe")
-"""Columns of a CSV sheet that are no settings."""
+"""Columns of a CSV sheet that are not settings."""
 
 
 class SheetError(InputError):
-    """A sheet with mistakes, one line each, which names the line or the scene."""
+    """A sheet with mistakes. ``problems`` has a line for each, with its place in the sheet."""
 
     def __init__(self, path: Path, problems: list[str]) -> None:
         mistakes = "1 mistake" if len(problems) == 1 else f"{len(problems)} mistakes"
-        super().__init__(f"{path.name} has {mistakes}", hint="correct the scenes above; no scene was started")
+        super().__init__(
+            f"{path.name} has {mistakes}", hint="correct the mistakes above; no scene was started"
+        )
         self.problems = problems
 
 
 class SheetRow(FrozenModel):
-    """One scene as the sheet gives it, the sheet's own defaults filled in."""
+    """A scene as it is in the sheet, with the defaults of the sheet filled in."""
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")] = Field(
         description=NAMES
@@ -40,28 +43,33 @@ class SheetRow(FrozenModel):
     input: Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
     recipe: str = "default"
     set: dict[str, str] = Field({})
-    """Setting -> its value in TOML."""
+    """Setting -> its value as TOML."""
 
 
 @dataclass(frozen=True)
 class SceneJob:
-    """One scene to bring through the stages."""
+    """A scene to run."""
 
     name: str
     source: Path
-    """Absolute."""
+    """Absolute path of the capture."""
     recipe: str
-    """A name, or the absolute path of a TOML file."""
+    """Name of a recipe, or absolute path of a TOML file."""
     overrides: tuple[str, ...]
-    """Settings as ``--set`` takes them."""
+    """Settings in the form of ``--set``."""
     where: str
-    """The place in the sheet."""
+    """Place in the sheet, for messages."""
 
 
 def read_scenes(path: Path) -> list[SceneJob]:
-    """Return the scenes of the sheet ``path``: a CSV where its name ends so, TOML otherwise.
+    """Return the scenes of a sheet. Settings and inputs are not checked yet.
 
-    Settings and inputs are not checked. Raises SheetError with all mistakes of form, InputError for no sheet.
+    Args:
+        path: The sheet: CSV if the name ends with ``.csv``, TOML otherwise.
+
+    Raises:
+        SheetError: The sheet has mistakes. All of them are listed.
+        InputError: The file cannot be read as a sheet.
     """
     try:
         text = read_text(path)
@@ -77,19 +85,21 @@ def read_scenes(path: Path) -> list[SceneJob]:
             problems += [f"{where}: {_problem(found)}" for found in error.errors(include_url=False)]
             continue
         if row.name in scenes:
-            problems.append(f"{where}: the name {row.name!r} is taken by {scenes[row.name].where}")
+            problems.append(f"{where}: {scenes[row.name].where} already has the name {row.name!r}")
         recipe = str(folder / row.recipe) if row.recipe.endswith(".toml") else row.recipe
         overrides = tuple(f"{name}={value}" for name, value in row.set.items())
         scenes[row.name] = SceneJob(row.name, folder / row.input, recipe, overrides, where)
     if problems:
         raise SheetError(path, problems)
     if not scenes:
-        raise InputError(f"{path} lists no scene", hint='write [[scene]], name = "room", input = "room.mp4"')
+        raise InputError(
+            f"{path} lists no scene", hint='example: [[scene]], name = "room", input = "room.mp4"'
+        )
     return list(scenes.values())
 
 
 def _problem(found: Any) -> str:
-    """Return one complaint of pydantic in a line."""
+    """Return one line for a mistake that pydantic found."""
     name = ".".join(map(str, found["loc"]))
     match found["type"]:
         case "missing":
@@ -103,14 +113,14 @@ def _problem(found: Any) -> str:
 
 
 def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the ``[[scene]]`` tables; ``recipe`` and ``[set]`` above them hold for all scenes."""
+    """Yield place and content of each ``[[scene]]`` table, with the defaults ``recipe`` and ``[set]``."""
     document = parse_toml(text, path.name)
     scenes = document.pop("scene", [])
     if not isinstance(scenes, list) or not all(isinstance(scene, dict) for scene in scenes):
-        raise InputError(f"{path.name}: scene is no list of tables", hint="write each scene as [[scene]]")
+        raise InputError(f"{path.name}: scene is not a list of tables", hint="write each scene as [[scene]]")
     for number, scene in enumerate(scenes, 1):
         values = merge(document, scene)
-        if isinstance(given := values.get("set"), dict):  # JSON's spelling of a value is TOML's too
+        if isinstance(given := values.get("set"), dict):  # a value in JSON is valid TOML
             values["set"] = {
                 name: json.dumps(value, ensure_ascii=False, default=str) for name, value in flattened(given)
             }
@@ -118,15 +128,15 @@ def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _csv_rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the rows. A column that is not in `PLAIN` is a setting; an empty cell says nothing."""
+    """Yield place and content of each row. Columns outside `PLAIN` are settings; empty cells are ignored."""
     reader = csv.DictReader(text.splitlines(keepends=True), restkey="more cells than columns", strict=True)
     try:
         columns = [column.strip() for column in reader.fieldnames or ()]
         named = [column for column in columns if column]
         if not {"name", "input"} <= set(named) or len(set(named)) < len(named):
             raise InputError(
-                f"{path.name}: the first line has to name each column once, with name and input among them",
-                hint="write name,input with a comma between them",
+                f"{path.name}: the first line must name each column once, and include name and input",
+                hint="separate the names with commas, for example name,input",
             )
         reader.fieldnames = columns
         for row in reader:
@@ -136,4 +146,4 @@ def _csv_rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, Any]]]:
                 yield f"{path.name}, line {reader.line_num}", {**values, "set": given}
     except csv.Error as error:
         where = f"{path.name}, line {reader.reader.line_num}"
-        raise SheetError(path, [f"{where}: this is no CSV: {error}"]) from error
+        raise SheetError(path, [f"{where}: this is not valid CSV: {error}"]) from error

@@ -9,7 +9,7 @@ from cleargs.capture.capture import Capture, External, Layout
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.layouts import colmap, images, llff, transforms, video
 from cleargs.errors import InputError
-from cleargs.plugins import load_part
+from cleargs.plugins import load_plugin
 
 MIN_FRAMES = 3
 """Two frames have no third to confirm what they see."""
@@ -20,7 +20,7 @@ LAYOUTS: tuple[Layout, ...] = (transforms, colmap, llff, video, images)
 def layout_of(source: Path, config: CaptureConfig) -> Layout:
     """Return the layout by ``ingest.layout``; ``auto`` is the first of `LAYOUTS` that detects ``source``."""
     if config.layout != "auto":
-        named: Layout = load_part("layouts", config.layout)
+        named: Layout = load_plugin("layouts", config.layout)
         return named
     poses = config.poses == "auto"
     return next(layout for layout in LAYOUTS if layout.detect(source, poses=poses))

@@ -1,4 +1,4 @@
-"""``cleargs batch``: all scenes of a sheet on this machine."""
+"""``cleargs batch``: run all scenes of a sheet on this machine."""
 
 from __future__ import annotations
 
@@ -24,32 +24,34 @@ from cleargs.cli.common import (
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.session import DeviceChoice, resolve_device
 
 
 @click.command(
     epilog="""\b
 Examples:
-  cleargs batch captures.toml --dry-run          check the sheet; hours, memory and disk
-  cleargs batch captures.toml                    run what is missing, scene by scene
+  cleargs batch captures.toml --dry-run          check the sheet; show hours, memory and disk
+  cleargs batch captures.toml                    run the missing stages, scene by scene
   cleargs batch captures.csv --quality draft
-A cluster runs the scenes of a sheet at the same time: see docs/cluster.md.
+
+To run scenes in parallel on a cluster, see docs/cluster.md.
 """
 )
 @click.argument("sheet", type=click.Path(dir_okay=False, path_type=Path))
 @output_option(
-    "The folder of the batch.  [default: SHEET with the ending .batch]",
+    "Folder of the batch.  [default: SHEET with the ending .batch]",
     "folder",
     metavar="BATCH",
     required=False,
 )
-@click.option("--until", metavar="STAGE", help="Stop after this stage.")
+@click.option("--until", metavar="STAGE", help="The last stage to run.")
 @quality_option
 @click.option(
-    "--dry-run", is_flag=True, help="Only check the sheet, and say what is to do and what it costs."
+    "--dry-run", is_flag=True, help="Only check the sheet; show which stages would run, and the cost."
 )
-@click.option("--summary", is_flag=True, help="Run nothing; write the summary and the page of what is there.")
-@report_option("Write a report of each scene, and BATCH/report/index.html, which leads to them.")
+@click.option("--summary", is_flag=True, help="Run nothing; write summary and page of the present results.")
+@report_option("Write a report of each scene, and BATCH/report/index.html with links to them.")
 @partial_option
 @work_options
 @json_option
@@ -70,23 +72,26 @@ def batch(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Bring each scene of SHEET (TOML or CSV) through the stages, one after the other.
+    """Run each scene of SHEET (TOML or CSV), one after the other.
 
-    A scene that fails does not stop the others. The same command again does only what is missing.
+    If a scene fails, the others still run. The same command again runs only the stages that are missing.
     BATCH/summary.csv has one row per scene.
     """
     dag.until(until)
     reporter = make_reporter(quiet)
-    looks_only = dry_run or summary  # at the results of a cluster, from a machine without its device
+    looks_only = dry_run or summary  # possible on a login node, which may lack the device of the cluster
     options = (
         *([] if looks_only else ["--threads", str(threads)]),
         *(["--allow-partial"] if allow_partial else []),
         *([] if wants_report else ["--no-report"]),
     )
-    resolved = "cuda" if looks_only and device == "cuda" else resolve_device(device, reporter.info)
+    resolved: Device = "cuda"
+    if not (looks_only and device == "cuda"):
+        resolved = resolve_device(device, reporter.info, test=not looks_only)
+    falls_back = device == "auto" and resolved == "cuda"
     root = (folder or sheet.with_suffix(".batch")).absolute()
     try:
-        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, quality, options)
+        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, quality, options, falls_back)
         scenes.check(sheet)
     except SheetError as error:
         for problem in error.problems:
@@ -110,8 +115,8 @@ def batch(
 
         try:
             page = write_batch(scenes, results)
-        except CleargsError as error:  # no failure of the batch
-            reporter.warn(f"there is no report: {error}; {error.hint}")
+        except CleargsError as error:  # the scenes themselves may have succeeded
+            reporter.warn(f"no report was written: {error}; {error.hint}")
     states = Counter(result.state for result in results)
     if as_json:
         print_json([asdict(result) for result in results])
@@ -128,7 +133,7 @@ def _line(result: Result) -> str:
 
 
 def _print_plans(batch: Batch, as_json: bool) -> None:
-    """Print hours, memory and disk of what is to do, per scene and in all."""
+    """Print hours, memory and disk of the missing stages, per scene and in total."""
     plans = [_plan_json(batch, scene) for scene in batch.scenes]
     total = {
         "hours": sum(plan["hours"] for plan in plans),
@@ -138,7 +143,7 @@ def _print_plans(batch: Batch, as_json: bool) -> None:
     if as_json:
         print_json({"folder": str(batch.folder), "device": batch.device, **total, "scenes": plans})
         return
-    for plan in [*plans, {"scene": "in all", **total, "note": f"{len(plans)} scenes"}]:
+    for plan in [*plans, {"scene": "total", **total, "note": f"{len(plans)} scenes"}]:
         cost = f"{plan['hours']:.2f} h, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
         click.echo(f"{plan['scene']}: {cost}; {plan['note']}")
 

@@ -1,4 +1,4 @@
-"""What several commands share: options, and their words."""
+"""Options and output functions of several commands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cleargs.splat.config import Quality
 F = TypeVar("F", bound=Callable[..., Any])
 
 DONE_IN_PART = 3
-"""Exit code of work that is not whole."""
+"""Exit code of work that is done only in part."""
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
@@ -27,7 +27,7 @@ store_option = click.option(
     envvar="CLEARGS_STORE",
     show_envvar=True,
     type=FOLDER,
-    help="Where results are kept; may be shared by runs.  [default: RUN/.store]",
+    help="Folder of the results, which several runs may share.  [default: RUN/.store]",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and results only.")
@@ -36,7 +36,7 @@ partial_option = click.option(
 )
 run_argument = click.argument("run", type=FOLDER)
 scene_option = click.option(
-    "--stage", "chosen", help="The stage whose scene to take.  [default: the last that is done]"
+    "--stage", "chosen", help="Stage whose scene to use.  [default: the last finished one]"
 )
 
 
@@ -44,25 +44,25 @@ threads_option = click.option(
     "--threads",
     type=click.IntRange(min=1),
     default=usable_cores,
-    help="CPU threads; results do not depend on it.  [default: all cores]",
+    help="Number of CPU threads, which does not change results.  [default: all cores]",
 )
 
 
 def output_option(
     help: str, name: str, *, metavar: str | None = None, required: bool = True
 ) -> Callable[[F], F]:
-    """``-o`` of a command that fills a folder."""
+    """Return the option ``-o`` of a command that fills a folder."""
     return click.option("-o", "--output", name, metavar=metavar, required=required, type=FOLDER, help=help)
 
 
 def file_option(help: str) -> Callable[[F], F]:
-    """``-o`` of a command that writes a file of a kind that its ending says."""
-    help = f"The new file; its ending says what to write: {help}"
+    """Return the option ``-o`` of a command that writes a file; ``help`` lists the endings of the formats."""
+    help = f"The new file. Its ending chooses the format: {help}"
     return click.option("-o", "--output", required=True, type=FILE, help=help)
 
 
 def report_option(help: str) -> Callable[[F], F]:
-    """``--report`` of a command that leaves a page at its end, unless it is told not to."""
+    """Return the option ``--report`` of a command that writes a report at its end by default."""
     return click.option(
         "--report/--no-report", "wants_report", default=True, help=f"{help}  [default: report]"
     )
@@ -71,12 +71,12 @@ def report_option(help: str) -> Callable[[F], F]:
 def parse_size(
     context: click.Context, parameter: click.Parameter, value: str | None
 ) -> tuple[int, int] | None:
-    """The callback of an option for a size of pictures; None where it is not given."""
+    """Parse the option for the size of pictures, as a callback of click; None if it is not given."""
     if value is None:
         return None
     match = re.fullmatch(r"(\d+)x(\d+)", value)
     if not match or not all(16 <= int(side) <= 8192 for side in match.groups()):
-        raise click.BadParameter("write WIDTHxHEIGHT in pixels, 480x270 say (16 to 8192 a side)")
+        raise click.BadParameter("give WIDTHxHEIGHT in pixels, for example 480x270 (16 to 8192 per side)")
     return int(match[1]), int(match[2])
 
 
@@ -84,20 +84,21 @@ quality_option = click.option(
     "--quality",
     type=click.Choice(get_args(Quality)),
     callback=lambda context, parameter, value: () if value is None else (f"g0.quality={value}",),
-    help="What trainings may cost: draft is a look within minutes, standard what you would publish, high "
-    "four times its steps and twice its Gaussians. Steps and budgets that a recipe names stay.  "
-    "[default: standard]",
+    help="Cost of all trainings: draft for a first impression, standard for a scene to publish, high for "
+    "four times as many steps and twice as many Gaussians. It does not change steps and budgets that a "
+    "recipe sets.  [default: standard]",
 )
 
 
 def work_options(command: F) -> F:
-    """Options of the commands that run stages."""
+    """Add the options of commands that compute: ``--device`` and ``--threads``."""
     command = click.option(
         "--device",
         type=click.Choice(["auto", "cpu", "cuda"]),
         default="auto",
         show_default=True,
-        help="Where to compute. auto is the CPU today: the GPU back end is untested on GPU hardware.",
+        help="Device to compute on. auto takes an NVIDIA GPU that passed its self-test (cleargs doctor "
+        "--gpu) and is faster than the CPU.",
     )(command)
     return threads_option(command)
 
@@ -120,7 +121,7 @@ def print_json(value: Any) -> None:
 
 
 def answer(as_json: bool, facts: Any, *lines: str) -> None:
-    """Print ``facts`` as JSON for a program, or ``lines`` for a reader."""
+    """Print ``facts`` as JSON, or else ``lines``."""
     if as_json:
         print_json(facts)
     else:

@@ -1,4 +1,4 @@
-"""``cleargs doctor``: what this machine offers, and what stands in the way."""
+"""``cleargs doctor``: a check of this machine."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from typing import Literal, NamedTuple
 import click
 
 import cleargs
+from cleargs import gpu
 from cleargs.cli.common import answer, json_option
 from cleargs.models.onnx import installed_runtimes
-from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
+from cleargs.pipeline.session import usable_cores
 from cleargs.splat.kernels.memory import available_memory
 from cleargs.splat.pace import cached_pace
 
@@ -35,7 +36,7 @@ MIN_DISK_GB = 5.0
 
 
 class Finding(NamedTuple):
-    """One thing looked at."""
+    """The result of one check."""
 
     what: str
     state: Literal["ok", "note", "bad"]
@@ -44,14 +45,15 @@ class Finding(NamedTuple):
 
 @click.command()
 @click.argument("folder", default=".", type=click.Path(file_okay=False, exists=True, path_type=Path))
+@click.option("--gpu", "wants_test", is_flag=True, help="Run the self-test of the GPU and print its result.")
 @json_option
-def doctor(folder: Path, as_json: bool) -> int:
+def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
     """Check this machine: versions, cores, memory, disk, device, caches.
 
-    FOLDER is where runs would be kept. Exit code 1 when something would keep a run from working.
+    FOLDER is the folder for runs. The exit code is 1 if a run would fail on this machine.
     """
-    obstacle, pace = cuda_obstacle(), cached_pace()
-    device = f"cpu; {UNUSED_GPU}" if obstacle is None else f"cpu ({obstacle})"
+    pace = cached_pace()
+    device, report = _device(wants_test)
     speed = "not measured yet" if pace is None else f"takes {pace:.2f} of the reference machine's time"
     findings = [
         Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
@@ -71,15 +73,32 @@ def doctor(folder: Path, as_json: bool) -> int:
             f" at {folder.absolute()}",
             "cleargs gc frees what no run needs",
         ),
-        Finding("device", "note" if obstacle is None else "ok", device),
+        device,
         Finding("pace", "ok", speed),
         _writable("runs", folder),
         _writable("caches", Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")),
         _writable("temporary files", Path(tempfile.gettempdir())),
     ]
     lines = (f"{state:<5} {what:<32} {text}" for what, state, text in findings)
-    answer(as_json, [finding._asdict() for finding in findings], *lines)
+    answer(as_json, [finding._asdict() for finding in findings], *lines, *report)
     return 1 if any(finding.state == "bad" for finding in findings) else 0
+
+
+def _device(wants_test: bool) -> tuple[Finding, list[str]]:
+    """Return the device that ``--device auto`` takes, and the lines of a self-test that runs now."""
+    if (obstacle := gpu.cuda_obstacle()) is not None:
+        return Finding("device", "bad" if wants_test else "ok", f"cpu ({obstacle})"), []
+    facts, report = gpu.current_facts(), []
+    if wants_test:
+        tested = gpu.self_test(facts, lambda line: click.echo(line, err=True))
+        report = ["", *tested.lines()]
+    elif (found := gpu.cached_test(facts)) is not None:
+        tested = found
+    else:
+        return Finding("device", "note", "cpu (the GPU is not tested yet: cleargs doctor --gpu)"), []
+    failed: Literal["note", "bad"] = "bad" if wants_test else "note"
+    state = "ok" if tested.fault is None else failed
+    return Finding("device", state, f"{tested.device} ({tested.reason})"), report
 
 
 def _library(name: str) -> Finding:
@@ -92,7 +111,7 @@ def _library(name: str) -> Finding:
 
 
 def _room(what: str, free: float, least_gb: float, place: str, advice: str) -> Finding:
-    """How many bytes are ``free``, with ``advice`` where they are few."""
+    """Return a finding about ``free`` bytes, with ``advice`` if there are too few."""
     words = f"{free / 1e9:.1f} GB free{place}"
     enough = free / 1e9 >= least_gb
     return Finding(what, "ok" if enough else "note", words if enough else f"{words}; {advice}")

@@ -1,4 +1,4 @@
-"""The console script, also ``python -m cleargs.cli.entry``."""
+"""Entry point of the program ``cleargs``, also as ``python -m cleargs.cli.entry``."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import sys
 
 
 def main() -> None:
-    """Run the command line and exit; with 2 where this is not Linux."""
-    # The import below takes a moment, in which Python would answer Ctrl-C with a traceback.
+    """Run the command line and exit. The exit code is 2 on other systems than Linux."""
+    # During the import below, Python would answer Ctrl-C with a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if not sys.platform.startswith("linux"):
-        print(f"error: ClearGS runs on Linux, this is {sys.platform}", file=sys.stderr)
-        print("hint: use a Linux machine or container; on Windows, WSL 2", file=sys.stderr)
+        print(f"error: ClearGS runs on Linux; this is {sys.platform}", file=sys.stderr)
+        print("hint: use a Linux machine or a container; on Windows, use WSL 2", file=sys.stderr)
         sys.exit(2)
-    # OpenMP threads that wait awake would hold a core that another program, or the very thread that they
-    # wait for, could have. PyTorch reads it once, when it is loaded.
+    # Waiting OpenMP threads should sleep: awake, they take a core from other programs, or even from the
+    # thread for which they wait. PyTorch reads the variable when it is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from cleargs.cli.main import main as run
 
     try:
         run()
-    finally:  # the work is done: there is nothing left to interrupt
+    finally:  # the command has ended: there is nothing left to interrupt
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 

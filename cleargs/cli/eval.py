@@ -13,7 +13,6 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import file_digest
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
-from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.run_results import SCENE, scene_stage
@@ -200,7 +199,7 @@ def _with_colours_aligned(evaluation: Evaluation) -> str:
 
 
 def _older(run: Path, path: Path) -> Report:
-    """The evaluations in ``path`` of scenes that are still those of ``run``."""
+    """Return the evaluations in ``path`` of scenes that ``run`` still has."""
     from cleargs.evaluate.eval_report import Report, read_report
 
     try:
@@ -214,7 +213,7 @@ def _older(run: Path, path: Path) -> Report:
 
 
 def _seen_before(report: Report) -> str:
-    """The line that says how many of the views show frames that a scene was trained on; "" for none."""
+    """Return a line with the number of views whose frames a scene was trained on; "" for none."""
     scenes = [found for found in report.evaluations if found.scene is not None]
     if any(found.trained_on is None for found in scenes):
         return "note: which frames the scene was trained on is not known"

@@ -1,4 +1,4 @@
-"""``cleargs export``: the scene as a file for other programs."""
+"""``cleargs export``: write the scene for other programs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ MODEL = "colmap/sparse/0"
 @click.command(
     epilog="""\b
 Examples:
-  cleargs export room -o room.ply                  the world that all tables of the run share
-  cleargs export room --world input -o room.ply    the world of the capture's own poses
+  cleargs export room -o room.ply                  in the normalised world of the run
+  cleargs export room --world input -o room.ply    in the world of the capture's poses
   cleargs export room -o room.compressed.ply       a quarter of the size: SuperSplat, Spark, Brush
-  cleargs export room -o room.spz                  a tenth of the size; room.glb and room.usdc as well
-  cleargs export room -o room.sog                  the same, for the web: SuperSplat, PlayCanvas
+  cleargs export room -o room.spz                  a tenth of the size, as room.glb and room.usdc
+  cleargs export room -o room.sog                  a tenth of the size, for SuperSplat and PlayCanvas
   cleargs export room -o room.ply --sh-degree 3    for the viewer of the Inria code
   cleargs export room -o room.ply --up z           for Blender; --up y for Spark and three.js
   cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
@@ -41,36 +41,36 @@ Examples:
     type=click.Choice(["normalised", "input"]),
     default="normalised",
     show_default=True,
-    help="input: undo the normalisation, so that the scene fits the capture's own poses.",
+    help="World of the file: that of the run (normalised), or that of the capture's poses (input).",
 )
 @click.option(
     "--up",
     type=click.Choice(["-y", "y", "z"]),
-    help="Turn the scene so that this axis of the file points up and the first frame's camera stands at the "
-    "origin and looks ahead: y for Spark and three.js, z for Blender.  [default: as SuperSplat takes it]",
+    help="Turn the scene so that this axis points up. The camera of the first frame is then at the origin "
+    "and looks ahead. Use y for Spark and three.js, z for Blender.  [default: the axes of SuperSplat]",
 )
 @click.option(
     "--prune",
     "rules",
     multiple=True,
     metavar="opacity:O|contribution:P",
-    help="Leave out Gaussians that are fainter than O (0 to 1), or that in no training frame make up P "
-    "pixels; tells what that costs in PSNR. May be given twice.",
+    help="Leave out Gaussians with an opacity below O (0 to 1), or with a contribution below P pixels to "
+    "every training frame. Prints the loss of PSNR. May be given twice.",
 )
 @click.option(
     "--crop",
     metavar="box:X,Y,Z,X,Y,Z|percentile:P",
-    help="Keep the Gaussians between two corners, in the coordinates of cameras.json, or in the box that "
-    "holds the middle P percent along each axis.",
+    help="Keep the Gaussians in a box. Give two corners in the coordinates of cameras.json, or P for the "
+    "middle P percent along each axis.",
 )
 @click.option(
     "--spz-version",
     type=click.Choice(["3", "4"]),
-    help="Of a .spz: 4 is the newer, 3 what more programs read.  [default: 3]",
+    help="Version of a .spz file. 4 is newer; more programs read 3.  [default: 3]",
 )
 @scene_option
 @file_option(".ply .compressed.ply .sog .spz .glb .usdc")
-@click.option("--force", is_flag=True, help="Replace the files where they exist.")
+@click.option("--force", is_flag=True, help="Replace existing files.")
 @click.pass_obj
 def export(
     dag: Dag,
@@ -85,16 +85,17 @@ def export(
     output: Path,
     force: bool,
 ) -> None:
-    """Write the scene of RUN to a file, its cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap)
-    next to it.
+    """Write the scene of RUN to a file.
+
+    The cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap) are written next to it.
     """
-    from cleargs.cli.export_pruning import cropped, parse_crop, parse_prune, pruned
+    from cleargs.cli.export_pruning import crop_scene, parse_crop, parse_prune, prune_scene
     from cleargs.splat.formats import check_options, format_of, padded, write_scene
 
     kind, version = format_of(output), None if spz_version is None else int(spz_version)
     check_options(kind, up=up, spz_version=version)
     if up is not None and world == "input":
-        raise InputError("--up turns a scene away from the input's world", hint="give one of the two")
+        raise InputError("--up and --world input exclude each other", hint="give one of them")
     thresholds, region = parse_prune(rules), parse_crop(crop)
     stem = output.name[: -len(kind) - 1]
     cameras, model = output.with_name(f"{stem}.cameras.json"), output.with_name(f"{stem}.colmap")
@@ -130,27 +131,29 @@ def export(
         similarity = orient_up(named[0][1], up)
 
     scene = read_ply(run / stage / SCENE)
-    remarks = []
+    messages = []
     if thresholds:
-        scene, remark = pruned(scene, thresholds, run, stage)
-        remarks.append(remark)
+        scene, message = prune_scene(scene, thresholds, run, stage)
+        messages.append(message)
     if sh_degree is not None:
         scene = padded(scene, sh_degree)
     if world == "input" and (offset := far_offset(scene.gaussians, similarity)):
         similarity["translation"] = similarity["translation"] - np.array(offset)
         file = output.with_name(f"{stem}.offset.json")
         write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
-        remarks.append(
+        messages.append(
             "single precision would round positions so far from the origin: the files are written without "
             f"the offset {offset}, which is in {file}"
         )
     if similarity:
         scene = transform_scene(scene, **similarity)
     if region is not None:
-        scene, remark = cropped(scene, region)
-        remarks.append(remark)
+        scene, message = crop_scene(scene, region)
+        messages.append(message)
     if kind == "ply" and 0 < (degree := scene.gaussians.sh_degree) < 3:
-        remarks.append(f"spherical harmonics of degree {degree}: for viewers of degree 3 only, --sh-degree 3")
+        messages.append(
+            f"spherical harmonics of degree {degree}: for viewers of degree 3 only, --sh-degree 3"
+        )
     if scene.gaussians.num == 0:
         raise InputError("no Gaussian is left", hint="prune or crop less")
     with disk_errors(output):
@@ -163,7 +166,7 @@ def export(
         transform_model(sparse, **similarity) if similarity else sparse,
         load_points(ingest).rgb,
     )
-    for remark in remarks:
-        click.echo(remark)
-    where = f"{up} is up" if up is not None else f"{world} world"
-    click.echo(f"{output}: the scene of {stage}, {scene.gaussians.num} Gaussians, {where}")
+    for message in messages:
+        click.echo(message)
+    axes = f"{up} is up" if up is not None else f"{world} world"
+    click.echo(f"{output}: scene of {stage}, {scene.gaussians.num} Gaussians, {axes}")

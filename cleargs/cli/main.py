@@ -1,4 +1,4 @@
-"""The console script ``cleargs``: its commands, and how errors become exit codes."""
+"""The program ``cleargs``: its commands, and the exit codes of errors."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from cleargs.pipeline.dag import Dag, installed
 from cleargs.safe_io import printable, require_utf8
 
 INTERRUPTED = 130
+"""Exit code after Ctrl-C, as in shells: 128 + SIGINT."""
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "run": ("cleargs.cli.run", "Turn a capture into a clean scene: all stages, or those that are missing."),
-    "status": ("cleargs.cli.run", "Say for each stage whether it is done, and what changed if not."),
+    "run": ("cleargs.cli.run", "Turn a capture into a clean scene: run all missing stages."),
+    "status": ("cleargs.cli.run", "Show which stages are done, and what changed if one is not."),
     "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
-    "watch": ("cleargs.cli.report", "Show a run in the browser while it is at work, then its report."),
-    "report": ("cleargs.cli.report", "Write a page that shows a run: the scene in 3D, and every frame."),
-    "render": ("cleargs.cli.render", "Render the scene: stills, and films along a path."),
+    "watch": ("cleargs.cli.report", "Follow a run in the browser, then see its report."),
+    "report": ("cleargs.cli.report", "Write the report of a run: the scene in 3D, and every frame."),
+    "render": ("cleargs.cli.render", "Render pictures and films of the scene."),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
-    "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
-    "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages."),
+    "eval": ("cleargs.cli.eval", "Measure the quality of a scene with sharp images."),
+    "batch": ("cleargs.cli.batch", "Run all scenes of a sheet."),
     "stage": ("cleargs.cli.run", "Run one stage of a prepared run."),
-    "settings": ("cleargs.cli.settings", "List every setting: default, range, meaning."),
+    "settings": ("cleargs.cli.settings", "List all settings with default, range and meaning."),
     "models": ("cleargs.cli.models", "List, install and verify model weights."),
-    "synth": ("cleargs.cli.synth", "Make a synthetic capture with known truth."),
-    "verify": ("cleargs.cli.store", "Read every file of a run again, and name what is damaged."),
+    "synth": ("cleargs.cli.synth", "Make a synthetic capture with known ground truth."),
+    "verify": ("cleargs.cli.store", "Check every file of a run for damage."),
     "gc": ("cleargs.cli.store", "Remove results that no run links to."),
     "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
 }
-"""Command -> (module that holds the click command of that name, _ for -; its line in ``cleargs --help``)."""
+"""Command -> (module with the click command of that name, where _ replaces -; line in ``cleargs --help``)."""
 
 ALIASES = {"explain": "status"}
 """Old name of a command -> its name."""
@@ -45,23 +46,23 @@ EPILOG = """\b
 Examples:
   cleargs run video.mp4 -o room              a video, an image folder, a COLMAP project ...
   cleargs run video.mp4 -o room --set rva.tau_R=0.7
-  cleargs show room                          what each stage found
-  cleargs status room                        what is done, what is missing, and which setting changed
-  cleargs settings g0                        what a stage can be told
-  cleargs report room                        a page to look at: room/report/index.html
+  cleargs show room                          results of each stage
+  cleargs status room                        which stages are done, and which setting changed
+  cleargs settings g0                        settings of a stage
+  cleargs report room                        a page for your browser: room/report/index.html
   cleargs render room -o room.mp4            a film along the capture's path
   cleargs export room -o room.compressed.ply
 
 \b
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,
-130 interrupted (the same command resumes).
+130 interrupted (give the same command again to resume).
 
 Terms: docs/glossary.md
 """
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command's module only when the command is used: help stays quick."""
+    """A group that imports the module of a command only when the command is used, so that help is fast."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -88,24 +89,24 @@ def cli(debug: bool) -> None:
     """Turn a handheld video of mixed quality into a clean 3D Gaussian Splatting scene.
 
     Five stages: ingest (poses), rva (which frames to trust), g0 (a first scene), rivr (repaired views) and
-    consolidate (the final scene). Results are kept by content: the same command again does only what is
+    consolidate (the final scene). Results are cached: the same command again runs only the stages that are
     missing.
     """
 
 
 def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program: click.Group = cli) -> None:
-    """Run the command line of ``program`` and exit. ``dag`` replaces the installed stages (tests)."""
-    from cleargs.cli.terminal import answer_signals, protect_streams
+    """Run the command line of ``program`` and exit. ``dag`` replaces the installed stages in tests."""
+    from cleargs.cli.terminal import handle_signals, protect_streams
 
     protect_streams()
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        answer_signals()
+        handle_signals()
         code = invoke(given, dag, program)
     except KeyboardInterrupt:  # before the command began, or after it ended
         code = _interrupted()
     if code == INTERRUPTED:
-        # Taking torch and Numba down in order may take seconds, and nothing waits for it.
+        # An orderly exit of torch and Numba may take seconds, and nothing depends on it.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -113,9 +114,10 @@ def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program
 
 
 def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = cli) -> int:
-    """Run one command; returns its exit code. Errors go to stderr as one line of cause and one of remedy.
+    """Run one command and return its exit code.
 
-    ``--debug`` may stand anywhere.
+    An error is printed on stderr: a line with the cause, and one with a hint. ``--debug``, anywhere among the
+    arguments, adds the traceback.
     """
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
@@ -126,11 +128,11 @@ def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = 
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
         return _interrupted()
-    except click.exceptions.NoArgsIsHelpError as error:  # a group alone: what it offers
+    except click.exceptions.NoArgsIsHelpError as error:  # a group without a command: its help
         error.show()
         return error.exit_code
     except BrokenPipeError:
-        return 1  # whoever read our output has gone
+        return 1  # the reader of the output has closed its pipe
     except Exception as error:
         if debug:
             traceback.print_exc()
@@ -141,12 +143,14 @@ def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = 
 
 
 def _interrupted() -> int:
-    click.echo("interrupted; finished work is kept, and the same command resumes from there", err=True)
+    from cleargs.cli.terminal import INTERRUPTED_LINE
+
+    click.echo(INTERRUPTED_LINE, err=True)
     return INTERRUPTED
 
 
 def explanation(error: Exception) -> tuple[int, str, str]:
-    """Exit code, cause and remedy for an error, each of the two in one line."""
+    """Return exit code, cause and hint for an error. Cause and hint are one line each."""
     match error:
         case CleargsError():
             return error.exit_code, _one_line(error), _one_line(error.hint)
@@ -166,13 +170,14 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             return 1, f"{error.strerror or _one_line(error)}{where}", "check the disk and its permissions"
         case _:
             cause = f"unexpected {type(error).__name__}: {_one_line(error)}"
-            return 1, cause, "run it again with --debug for the traceback, and please report it"
+            return 1, cause, "repeat the command with --debug to see the traceback, and please report it"
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether memory ran out, which threads and libraries that are being loaded say in words of their own.
+    """Return True if the cause is a lack of memory.
 
-    A package whose library cannot be loaded may put words of its own over the cause.
+    Threads and libraries that fail to load have different messages for it. A package may hide the message
+    of its library, so the cause of an error is checked too.
     """
     text = str(error)
     match error:

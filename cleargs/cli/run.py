@@ -1,4 +1,4 @@
-"""``cleargs run``, ``stage`` and ``status``: the stages of a run, made or only looked at."""
+"""``cleargs run``, ``stage`` and ``status``: run the stages of a run, or show their state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from cleargs.cli.common import (
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.cli.report import older_report, report_on
+from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
 from cleargs.pipeline.run_file import read_run_file
@@ -35,39 +35,39 @@ from cleargs.report.formatting import duration
 from cleargs.safe_io import printable
 
 Summaries = Mapping[str, Mapping[str, Any]]
-"""Stage -> the figures of its manifest."""
+"""Stage -> figures in its manifest."""
 
 PICTURES = ("before_after.png", "candidates.png")
-"""What to look at, the first that a stage has."""
+"""Pictures of a stage to look at after a run; the first that exists is named."""
 
 
 @click.command(
     epilog="""\b
 Examples:
   cleargs run video.mp4 -o room
-  cleargs run video.mp4 -o room --start 3 --end 40        a stretch of it, in seconds
-  cleargs run photos/ -o room --workflow smoke            does it work at all, in a minute
-  cleargs run photos/ -o room --quality draft             a look; then the same with --quality standard
+  cleargs run video.mp4 -o room --start 3 --end 40        a part of it, in seconds
+  cleargs run photos/ -o room --workflow smoke            a quick test
+  cleargs run photos/ -o room --quality draft             a first impression; later --quality standard
   cleargs run photos/ -o room --set ingest.max_frames=60 --set rva.tau_R=0.7
-  cleargs run photos/ -o room --dry-run                   what would be done, why, and the cost
+  cleargs run photos/ -o room --dry-run                   the stages that would run, why, and the cost
   cleargs run photos/ -o room --until rva                 stop before training
-  cleargs run photos/ -o room --reset                     with the recipe's settings again
+  cleargs run photos/ -o room --reset                     go back to the settings of the recipe
 """
 )
 @click.argument("source", metavar="INPUT", type=click.Path(path_type=Path))
-@output_option("The run folder; the run resumes if it exists.", "folder", metavar="RUN")
+@output_option("The run folder. An existing run is resumed.", "folder", metavar="RUN")
 @click.option(
     "--workflow",
     metavar="NAME|FILE.toml",
-    help="The recipe: default, smoke, paper, paper-open, or a TOML file of your own.  [default: default; an "
-    "existing run keeps its settings]",
+    help="The recipe: default, smoke, paper, paper-open, or your TOML file.  [default: default; an existing "
+    "run keeps its settings]",
 )
 @click.option(
     "--set",
     "overrides",
     multiple=True,
     metavar="STAGE.FIELD=VALUE",
-    help="Change one setting (cleargs settings lists them).",
+    help="Change one setting. `cleargs settings` lists them.",
 )
 @quality_option
 @click.option(
@@ -82,14 +82,12 @@ Examples:
     metavar="S",
     help="Take a video up to this second (ingest.end).",
 )
-@click.option("--seed", type=click.IntRange(min=0), help="Seed of all randomness.  [default: 0]")
-@click.option("--reset", is_flag=True, help="Forget the settings of an existing run: start from the recipe.")
-@click.option("--until", metavar="STAGE", help="Stop after this stage.")
-@click.option(
-    "--force", multiple=True, metavar="STAGE", help="Make the stage again, even if its results are there."
-)
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of all random numbers.  [default: 0]")
+@click.option("--reset", is_flag=True, help="Replace the settings of an existing run by those of the recipe.")
+@click.option("--until", metavar="STAGE", help="The last stage to run.")
+@click.option("--force", multiple=True, metavar="STAGE", help="Run this stage even if its results exist.")
 @report_option("Write RUN/report/index.html at the end, as `cleargs report` does.")
-@click.option("--dry-run", is_flag=True, help="Only say what would be done, why, and what it costs.")
+@click.option("--dry-run", is_flag=True, help="Only show which stages would run, why, and the cost.")
 @partial_option
 @work_options
 @store_option
@@ -121,9 +119,8 @@ def run(
     """Turn INPUT into a clean scene in the folder RUN.
 
     INPUT is a video, a folder of videos or of images, a COLMAP project (images/ and sparse/0), or a folder
-    with transforms.json or poses_bounds.npy. Results that are there already are not made again; an interrupted
-    run resumes. An existing run keeps its settings (RUN/run.toml) unless --set, --workflow or --reset say
-    otherwise.
+    with transforms.json or poses_bounds.npy. Existing results are reused, and an interrupted run resumes. An
+    existing run keeps its settings (RUN/run.toml). Change them with --set, --workflow or --reset.
     """
     dag.until(until)
     reporter = make_reporter(quiet)
@@ -137,6 +134,7 @@ def run(
         reset=reset,
         store=store,
         device=device,
+        test_gpu=not dry_run,
         say=reporter.info,
     )
     with opened_store(settings.store) as opened:
@@ -147,8 +145,8 @@ def run(
             return 0
         runner = Runner(dag, settings, opened, threads, reporter)
         outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
-        page = report_on(runner.planner, outcomes) if wants_report else None
-        if not wants_report and (line := older_report(settings.folder, dag)):
+        page = write_run_report(runner.planner, outcomes) if wants_report else None
+        if not wants_report and (line := outdated_report_note(settings.folder, dag)):
             reporter.info(line)
     if as_json:
         print_json([outcome_json(outcome) for outcome in outcomes])
@@ -172,7 +170,7 @@ Example:
 )
 @click.argument("name")
 @run_argument
-@click.option("--force", is_flag=True, help="Make the stage again, even if its results are there.")
+@click.option("--force", is_flag=True, help="Run the stage even if its results exist.")
 @click.option("--report", "wants_report", is_flag=True, help="Write RUN/report/index.html at the end.")
 @partial_option
 @work_options
@@ -193,9 +191,9 @@ def stage(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Run the one stage NAME of RUN with the settings in RUN/run.toml.
+    """Run the stage NAME of RUN with the settings in RUN/run.toml.
 
-    The stages before it must be done.
+    All stages before it must be done.
     """
     dag.check(name)
     resolved = None if device == "auto" else resolve_device(device, click.echo)
@@ -204,7 +202,7 @@ def stage(
         runner = Runner(dag, settings, opened, threads, make_reporter(quiet))
         outcome = runner.run_stage(name, force=force, allow_partial=allow_partial)
         if wants_report:
-            report_on(runner.planner, [outcome])
+            write_run_report(runner.planner, [outcome])
     if as_json:
         print_json(outcome_json(outcome))
     else:
@@ -215,9 +213,9 @@ def stage(
 @click.command(
     epilog="""\b
 States:
-  done     the results are there and whole
-  partial  the results are there, something is missing; the next run tries again
-  missing  to be made: the line says which setting, input file or version changed
+  done     all results exist
+  partial  some results are missing; the next run retries them
+  missing  no results for the current settings and inputs; the line shows what changed
 """
 )
 @run_argument
@@ -225,30 +223,33 @@ States:
 @json_option
 @click.pass_obj
 def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
-    """Say for each stage of RUN whether it is done, partial or missing, and what changed."""
+    """Show for each stage of RUN if it is done, partial or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
     with opened_store(settings.store) as opened:
         planner = Planner(dag, settings, opened, usable_cores(), make_reporter())
         print_plans(planner.plan(), as_json)
 
 
-# -- what became of stages, or would become of them ----------------------------------------------------------
+# -- outcomes and plans -------------------------------------------------------------------------------------
 
 
 def exit_code(outcomes: Sequence[StageOutcome]) -> int:
-    """0, or 3 where something is missing."""
+    """Return 0, or 3 if something is missing."""
     return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
 
 
 def print_outcomes(outcomes: Sequence[StageOutcome], run: Path, report: Path | None = None) -> None:
-    """What is missing (on stderr); then at most five lines: what was made, how good it is, how long it took,
-    what to look at (the ``report``, a picture), the next command.
+    """Print missing outputs on stderr, then at most five lines on stdout.
+
+    The lines name the result, its quality, the time, the ``report`` and a picture, and the next command.
     """
     last = outcomes[-1].manifest
     for missing in (*last.inherited, *(f"{last.stage}: {line}" for line in last.missing)):
         click.echo(f"missing: {printable(missing)}", err=True)
     if last.status == "partial":
-        click.echo("hint: the same command tries again; --allow-partial continues without it", err=True)
+        click.echo(
+            "hint: give the same command again to retry, or --allow-partial to go on without it", err=True
+        )
     summaries = {outcome.stage: outcome.manifest.summary for outcome in outcomes}
     scene = "scene.ply" in last.files
     partial = ", in part" if last.status == "partial" else ""
@@ -269,7 +270,7 @@ def print_outcomes(outcomes: Sequence[StageOutcome], run: Path, report: Path | N
 
 
 def _extent(summaries: Summaries) -> str:
-    """How large the result is: frames with a pose, and how many of them were repaired."""
+    """Return the numbers of placed, strong and repaired frames, as far as they are known."""
     ingest, consolidate = summaries.get("ingest", {}), summaries.get("consolidate", {})
     words = []
     if "registered" in ingest and "frames" in ingest:
@@ -282,25 +283,25 @@ def _extent(summaries: Summaries) -> str:
 
 
 def _quality(summaries: Summaries) -> str:
-    """What is known of how good the last scene is; "" for nothing."""
+    """Return the quality of the last scene; "" if it is unknown."""
     scenes = {
         stage: figures for stage, figures in summaries.items() if figures.get("psnr_unseen") is not None
     }
     if not scenes:
         return ""
     last, figures = list(scenes.items())[-1]
-    first = summaries.get("g0", {}).get("psnr_unseen")  # `cleargs stage` tells of one stage alone
-    beside = f" (first scene {first:.1f})" if last != "g0" and first is not None else ""
+    first = summaries.get("g0", {}).get("psnr_unseen")  # not with `cleargs stage`
+    compared = f" (first scene {first:.1f})" if last != "g0" and first is not None else ""
     text = (
-        f"PSNR {figures['psnr_unseen']:.1f} dB{beside} on pixels that no training saw; "
-        "views off the path are worse"
+        f"PSNR {figures['psnr_unseen']:.1f} dB{compared} on pixels that no training saw; "
+        "views off the camera path are worse"
     )
     harm = figures.get("held_back", {}).get("harm")
     return f"{text}. Rejected: {harm}" if harm else text
 
 
 def _times(outcomes: Sequence[StageOutcome]) -> str:
-    """How long this call worked, stage by stage, and what it found."""
+    """Return the time that this call took per stage, and the stages whose results it found."""
     made = [outcome for outcome in outcomes if outcome.how == "made"]
     found = [outcome.stage for outcome in outcomes if outcome.how == "found"]
     words = []
@@ -308,12 +309,12 @@ def _times(outcomes: Sequence[StageOutcome]) -> str:
         stages = ", ".join(f"{outcome.stage} {duration(outcome.manifest.seconds)}" for outcome in made)
         words.append(f"{duration(sum(outcome.manifest.seconds for outcome in made))} ({stages})")
     if found:
-        words.append(f"already there: {', '.join(found)}")
+        words.append(f"reused: {', '.join(found)}")
     return "; ".join(words)
 
 
 def _next(summaries: Summaries, run: Path, scene: bool) -> str:
-    """The command to give next."""
+    """Return the command that the user may want next."""
     if not scene:
         stage = " rva" if list(summaries)[-1] == "rva" else ""
         return f"cleargs show {quote(str(run))}{stage}"
@@ -323,13 +324,13 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
 
 
 def outcome_json(outcome: StageOutcome) -> dict[str, Any]:
-    """One outcome as JSON values."""
+    """Return an outcome as JSON values."""
     facts = {"stage": outcome.stage, "how": outcome.how, "folder": str(outcome.folder)}
     return {**facts, **manifest_json(outcome.manifest)}
 
 
 def print_plans(plans: list[StagePlan], as_json: bool) -> None:
-    """The state of each stage and its reasons; then the expected cost."""
+    """Print the state of each stage with its reasons, then the expected cost."""
     lines, facts = [], []
     for plan in plans:
         first, *others = plan.reasons or ("",)

@@ -1,4 +1,4 @@
-"""``cleargs settings``: every setting of the stages, from their models."""
+"""``cleargs settings``: list the settings of the stages."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from cleargs.pipeline.settings import settings_of
 @click.command(
     epilog="""\b
 Examples:
-  cleargs settings                  all of them
-  cleargs settings g0               those of one stage
+  cleargs settings                  all settings
+  cleargs settings g0               the settings of one stage
   cleargs run photos/ -o room --set g0.steps=4000 --set ingest.holdout=every:8
 """
 )
@@ -23,7 +23,7 @@ Examples:
 @json_option
 @click.pass_obj
 def settings(dag: Dag, stage: str | None, as_json: bool) -> None:
-    """List name, default, range and meaning of every setting, or of those of one STAGE."""
+    """List all settings, or those of one STAGE, with default, range and meaning."""
     names = dag.names if stage is None else (dag.check(stage),)
     found = {name: settings_of(name, dag.load(name).CONFIG) for name in names}
     if as_json:

@@ -1,4 +1,4 @@
-"""``cleargs show``: the tables and figures of a run in the terminal, and single frames in words."""
+"""``cleargs show``: tables and figures of a run in the terminal, and all facts about a frame."""
 
 from __future__ import annotations
 
@@ -28,38 +28,39 @@ from cleargs.report.report_json import linked_manifests
 if TYPE_CHECKING:
     from cleargs.report.frames import FrameRow
 
-MAX_LISTED = 16  # items of a list that are spelt out
-MAX_COUNTED = 12  # different values of a column of words that are counted value by value
+MAX_LISTED = 16  # items of a list that are printed
+MAX_COUNTED = 12  # distinct words in a column whose numbers are printed one by one
 MAX_NAME_LENGTH = 14  # characters of a frame's name in a table
-MIN_FAULT = 0.2  # distance of a cue from its best value from which it is reported
-LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # of the picture of a frame; px
-PLOT = "rva-plot.png"  # the picture of --plot in the run's folder, unless another is named
-HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures for programs
+MIN_FAULT = 0.2  # smaller distances of a cue from its best value are not reported
+LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; width in px
+PLOT = "rva-plot.png"  # default file of --plot in the run folder
+HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
 
 LABELS: Mapping[str, str] = {
     "registered": "frames with a pose",
     "test": "frames held out for testing",
-    "given_poses_missed_px": "median distance of features from their points at the given poses, px",
-    "pose_convention": "convention by which the given poses fit the images",
+    "given_poses_missed_px": "median reprojection error at the given poses, px",
+    "pose_convention": "convention of the given poses",
     "kept_out_matches_off_px": "median error of matches that took no part, by origin of the poses, px",
     "lens": "camera model that was fitted",
-    "stand_in": "frames that stand in for reliable ones",
-    "effective_frames": "equivalent frames of full weight",
-    "bins": "stretches of the trajectory",
-    "bins_uncovered_before": "stretches without a usable frame at first",
+    "stand_in": "stand-ins for reliable frames",
+    "effective_frames": "effective number of frames",
+    "bins": "sections of the trajectory",
+    "bins_uncovered_before": "sections without a usable frame at first",
     "psnr_strong": "training PSNR of the strong frames, dB",
     "psnr_active": "training PSNR, dB",
     "psnr_unseen": "PSNR of pixels that no training saw, dB",
     "psnr_before": "PSNR in the first scene, dB",
     "psnr_after": "PSNR now, dB",
     "repairs_refused": "repairs refused by the gate",
-    "tie_breaks": "decided by the tie-break scorer",
+    "tie_breaks": "choices by the tie-break scorer",
     "latest_rounds": "repairs by round",
+    "held_back": "judges",
 }
-"""Figure of a manifest -> its label, where its name is not enough."""
+"""Figure of a manifest -> its label, if its name is not clear."""
 
 OVERVIEW = ("frames", "registered", "test", "points", "roles", "gaussians", "psnr_unseen", "repairs")
-"""Figures that the overview of a run shows, next to the scene that was ``published``."""
+"""Figures in the overview of a run, which also names the ``published`` scene."""
 
 MODELS = {
     "none": "nothing found",
@@ -68,11 +69,11 @@ MODELS = {
     "both": "motion blur and rolling shutter",
     "defocus": "defocus",
 }
-"""Model of a frame's formation -> its name."""
+"""Model of a frame's image formation -> its name."""
 
 SOURCES = {
     "observation": "the frame as filmed",
-    "deblurred": "the frame without its motion",
+    "deblurred": "the deblurred frame",
     "render": "the render",
 }
 """Input of the expert -> its name."""
@@ -80,11 +81,11 @@ SOURCES = {
 SCORES = {
     "R": "reliable appearance",
     "B": "risk of degradation",
-    "G": "worth of its place",
+    "G": "geometric utility",
     "C": "coverage gained",
     "D": "new directions",
-    "O": "seen already",
-    "Z": "middle of its stretch",
+    "O": "overlap with reliable frames",
+    "Z": "centrality in its section",
 }
 """Score of RVA -> its meaning."""
 
@@ -93,35 +94,35 @@ SCORES = {
     epilog="""\b
 Examples:
   cleargs show room                 all stages: state, time, size, figures
-  cleargs show room rva             what became of every frame, and why
-  cleargs show room rva --columns   what the tables hold, column by column
-  cleargs show room g0 --rows 5     rows of each table, evenly spread
+  cleargs show room rva             role and weight of each frame, and why
+  cleargs show room rva --columns   the columns of the tables, with their meanings
+  cleargs show room g0 --rows 5     rows of each table, evenly spaced
   cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
-  cleargs show room --frame 3       all about one frame, and its layers: room/frame-000003.png
+  cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
 )
 @run_argument
 @click.argument("stage", required=False)
 @click.option(
-    "--rows", type=click.IntRange(min=0), help="How many rows of each table.  [default: 8 of step tables]"
+    "--rows", type=click.IntRange(min=0), help="Rows of each table.  [default: 8 in tables of training steps]"
 )
 @click.option("--columns", is_flag=True, help="Describe the tables column by column.")
 @click.option(
     "--plot",
     is_flag=True,
-    help="With rva, instead of its tables: draw trajectory, scores, roles, weights, best and worst frames.",
+    help="For rva: draw trajectory, scores, roles, weights, and the best and worst frames.",
 )
 @click.option(
     "--frame",
     type=click.IntRange(min=0),
     metavar="N",
-    help="In place of tables: all about frame N, with a picture of its layers side by side.",
+    help="Show all facts about frame N, and write a picture of its layers.",
 )
 @click.option(
     "-o",
     "--output",
     type=FILE,
-    help=f"Picture of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
+    help=f"File of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
 )
 @json_option
 @click.pass_obj
@@ -136,17 +137,17 @@ def show(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Show what the stages of RUN found, or the tables of one STAGE."""
+    """Show the results of the stages of RUN, or the tables of one STAGE."""
     draws = output is not None and output.suffix.lower() == ".png" and (plot or frame is not None)
     for cause, wrong, example in (
-        ("--plot draws the stage rva", plot and stage != "rva", "rva --plot"),
-        ("--frame is about all stages", frame is not None and stage is not None, f"--frame {frame}"),
+        ("--plot needs the stage rva", plot and stage != "rva", "rva --plot"),
+        ("--frame cannot be used with a stage", frame is not None and stage is not None, f"--frame {frame}"),
         (
-            "--rows and --columns are about the tables of a stage",
+            "--rows and --columns need the name of a stage",
             stage is None and (columns or rows is not None),
             "rva --columns",
         ),
-        ("--output names the PNG of --plot or --frame", output and not draws, "rva --plot -o FILE.png"),
+        ("--output needs --plot or --frame, and a .png file", output and not draws, "rva --plot -o FILE.png"),
     ):
         if wrong:
             raise InputError(cause, hint=f"cleargs show {run} {example}")
@@ -172,7 +173,7 @@ def show(
 
 
 def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
-    """Print a line per stage, and the present work with its preview."""
+    """Print one line per stage, then the running stage with its preview."""
     rows = []
     for name, manifest in manifests.items():
         if manifest is None:
@@ -188,7 +189,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
         click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
     if work := running_stage(run.folder, run.store):
         count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
-        click.echo(f"\n{work.stage} is at work: {', '.join(filter(None, (work.label, count, work.note)))}")
+        click.echo(f"\n{work.stage} is running: {', '.join(filter(None, (work.label, count, work.note)))}")
         if preview := preview_of(work, run.store):
             click.echo(f"preview: {preview.path}")
 
@@ -196,7 +197,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
 def _show_stage(
     run: Path, done: Mapping[str, Manifest], stage: str, rows: int | None, columns: bool, as_json: bool
 ) -> None:
-    """Print the figures of a stage, and its tables as far as they are asked for."""
+    """Print the figures of a stage, and the requested tables."""
     manifest = done[stage]
     names = [name for name in sorted(manifest.files) if name.endswith(".parquet") and "/" not in name]
     tables = {name: read_any_table(run / stage / name) for name in names}
@@ -213,13 +214,13 @@ def _show_stage(
         return
     lines = [("missing", missing) for missing in (*manifest.inherited, *manifest.missing)]
     lines += labelled(manifest.summary)
-    lines.append(("made in", f"{manifest.seconds:.1f} s on {manifest.device}, {manifest.started}"))
+    lines.append(("time", f"{manifest.seconds:.1f} s on {manifest.device}, started {manifest.started}"))
     _print_table(lines, title=f"{stage}: {manifest.status}")
     if frames is not None and not columns and rows is None:
         click.echo()
         named = ((row | {"name": short_name(row["name"])}).values() for row in frames)
         cells = ([f"{x:.2f}" if isinstance(x, float) else text_of(x) for x in row] for row in named)
-        _print_table(cells, *frames[0] if frames else (), wraps="reason")  # all fits on 80 columns
+        _print_table(cells, *frames[0] if frames else (), wraps="reason")  # fits in 80 columns
         return
     for name, data in tables.items():
         wanted = rows if rows is not None else 8 if "step" in data.column_names and not columns else 0
@@ -228,20 +229,20 @@ def _show_stage(
             column_rows = (_column_row(*item) for item in describe_table(data).items())
             heads = ("column", "min .. median .. max, or counts", "meaning")
             _print_table(column_rows, *heads, title=f"\n{title}")
-        if wanted and data.num_rows:  # one row per column of the terminal
+        if wanted and data.num_rows:  # transposed: a row of the table is a column here
             cells = ([text_of(value) for value in row.values()] for row in sampled_rows(data, wanted))
             turned = zip(data.column_names, *cells, strict=True)
             _print_table(turned, title="" if columns else f"\n{title}")
     if not columns:
-        click.echo(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
+        click.echo(f"\nall columns: cleargs show {quote(str(run))} {stage} --columns")
 
 
 def describe_table(table: pa.Table) -> dict[str, dict[str, Any]]:
-    """Column -> its meaning (from the field's metadata), nulls, and figures that suit its type.
+    """Return column -> its type, meaning (from the field's metadata), number of nulls, and figures.
 
-    Words and booleans: ``counts`` of each value, most frequent first (``distinct`` where there are many, or
-    where every row has its own).
-    Numbers: ``min``, ``median``, ``mean``, ``max`` over the values that are neither null nor NaN.
+    The figures of words and booleans are ``counts`` of each value, most frequent first, or ``distinct`` if
+    there are many values, or one per row. Those of numbers are ``min``, ``median``, ``mean`` and ``max`` of
+    the finite values.
     """
     described = {}
     for field in table.schema:
@@ -269,14 +270,14 @@ def _figures(values: pa.ChunkedArray) -> dict[str, Any]:
 
 
 def sampled_rows(table: pa.Table, wanted: int) -> list[dict[str, Any]]:
-    """``wanted`` rows (at most), evenly spread, the first and the last among them; the last for one."""
+    """Return at most ``wanted`` rows, evenly spaced from the first to the last; the last one if only one."""
     places = np.linspace(table.num_rows - 1, 0, min(wanted, table.num_rows)).round().astype(int)
     rows: list[dict[str, Any]] = table.take(places[::-1]).to_pylist()
     return rows
 
 
 def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Label and text of each figure: numbers of one kind in one line, other nested figures in their own."""
+    """Yield label and text of each figure. Numbers of one kind share a line; other nested figures do not."""
     for name, value in summary.items():
         label = prefix + LABELS.get(name, name.replace("_", " "))
         if name in HIDDEN:
@@ -298,7 +299,7 @@ def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def text_of(value: Any) -> str:
-    """A value for a reader: four figures of a number, yes and no, "9 restored, 3 render" for counts."""
+    """Return a value as text: numbers with four digits, "yes" or "no", counts as "9 restored, 3 render"."""
     match value:
         case None:
             return ""
@@ -316,7 +317,7 @@ def text_of(value: Any) -> str:
     return str(value)
 
 
-# -- frames in words ----------------------------------------------------------------------------------------
+# -- all frames ---------------------------------------------------------------------------------------------
 
 
 def frame_rows(
@@ -326,8 +327,10 @@ def frame_rows(
 ) -> list[dict[str, Any]]:
     """Return role, scores, worst cue, reason and repair of every frame.
 
-    rows: those of rva/frames.parquet; settings: the configuration that they were made with; repairs: the rows
-    of rivr/selection.parquet, None before RIVR (then there is no "repair").
+    Args:
+        rows: The rows of ``rva/frames.parquet``.
+        settings: The settings of RVA that made these rows.
+        repairs: The rows of ``rivr/selection.parquet``; None before RIVR, when frames have no "repair".
     """
     latest = {row["frame_id"]: row for row in sorted(repairs or (), key=lambda row: int(row["round"]))}
     found = []
@@ -341,13 +344,13 @@ def frame_rows(
 
 
 def short_name(name: str) -> str:
-    """The end of a frame's name, which tells it from the others."""
+    """Return the end of a frame's name, which differs most between frames."""
     last = name.rpartition("/")[2]
     return last if len(last) <= MAX_NAME_LENGTH else f"…{last[1 - MAX_NAME_LENGTH :]}"
 
 
 def worst_cue(row: Mapping[str, Any]) -> str:
-    """The cue farthest from its best value, and its value: "motion blur 0.82"; "" without a fault."""
+    """Return the cue farthest from its best value, as "motion blur 0.82"; "" if all are good."""
     off = {name: 1.0 - value for name, value in row.items() if name.startswith("r_") and value is not None}
     off |= {name: value for name, value in row.items() if name.startswith("b_") and value is not None}
     worst = max(off, key=lambda name: off[name], default="")
@@ -357,7 +360,7 @@ def worst_cue(row: Mapping[str, Any]) -> str:
 
 
 def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    """The threshold that a frame passed or missed, which gave it its role."""
+    """Return the reason for the role of a frame: the threshold that it passed or missed."""
     if row["R"] is None:
         return "not scored"
     if row["G"] is None:
@@ -377,14 +380,14 @@ def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
 
 
 def _missed(row: Mapping[str, Any], min_R: float, max_B: float) -> str:
-    """The threshold of the two that the frame misses; "" for none."""
+    """Return the first of the two thresholds that the frame misses; "" if it misses none."""
     if row["R"] < min_R:
         return f"R < {min_R:.4g}"
     return f"B > {max_B:.4g}" if row["B"] > max_B else ""
 
 
 def _repair(row: Mapping[str, Any] | None) -> str:
-    """RIVR's choice in a frame's last round: the layer that supervises, refused, or none."""
+    """Return RIVR's choice in the last round of a frame: a layer, "as filmed", "refused" or "none"."""
     from cleargs.rivr.gates import REFUSED
 
     if row is None:
@@ -398,9 +401,9 @@ def _repair(row: Mapping[str, Any] | None) -> str:
 
 
 def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: Path, as_json: bool) -> None:
-    """Write the picture of a frame's layers; print all facts for programs, or lines for readers.
+    """Write a picture of a frame's layers, and print all facts about it, as lines or as JSON.
 
-    Raises InputError, StoreError.
+    Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
     from cleargs.report.frames import MEANINGS, camera_of, load_rows
     from cleargs.rivr.tables import REPAIRS
@@ -434,9 +437,9 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
 
 
 def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow) -> list[str]:
-    """Write the layers of a frame side by side, labelled, as a PNG; returns their names.
+    """Write the layers of a frame side by side with labels, as a PNG. Return their names.
 
-    They are the frame as filmed, those of the latest round's EXR, and the last scene at the frame.
+    They are the raw frame, the layers in the EXR of the latest round, and the last scene at this pose.
     """
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
@@ -457,7 +460,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
 
 def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
-    """Label and text of every line for a reader."""
+    """Yield label and text of each line about a frame."""
     from cleargs.report.frames import CHOICES, scores_of
 
     frame, judged = row.frame, facts["rva"]
@@ -466,16 +469,16 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple
     if frame.time_s is not None:
         yield "time", f"{frame.time_s:.2f} s"
     if frame.split == "test":
-        yield "held out", "for testing: it enters no training"
+        yield "held out", "for testing; no training uses it"
     if not frame.registered:
         yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
     else:
         centre = ", ".join(f"{value:.3f}" for value in facts["centre"])
         quaternion = ", ".join(f"{facts[name]:.3f}" for name in ("qw", "qx", "qy", "qz"))
-        yield "pose", f"at ({centre}) of the run's world, world to camera ({quaternion}), w first"
+        yield "pose", f"camera at ({centre}), world-to-camera rotation w, x, y, z ({quaternion})"
         if frame.placed:
             yield "placed by", frame.placed
-        yield "points", f"{frame.n_points} sparse points seen"
+        yield "points", f"sees {frame.n_points} sparse points"
     if judged:
         yield "role", f"{judged['role']}, weight {row.weight:.2f}: {judged['reason']}"
         known = {name: value for name, value in judged.items() if value is not None}
@@ -483,22 +486,25 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple
             "scores",
             ", ".join(f"{name} {known[name]:.2f} {SCORES[name]}" for name in SCORES if name in known),
         )
-        for label, prefix in (("good, of 1", "r_"), ("bad, of 1", "b_")):
+        for label, prefix in (("quality, 0 to 1", "r_"), ("faults, 0 to 1", "b_")):
             cues = (name for name in known if name.startswith(prefix))
             yield label, ", ".join(f"{name[2:].replace('_', ' ')} {known[name]:.2f}" for name in cues)
         yield "worst cue", judged["worst_cue"] or "none"
     if row.gain_ev is not None:
-        yield "exposure", f"{row.gain_ev:+.2f} stops compared with the scene's"
+        yield "exposure", f"{row.gain_ev:+.2f} stops relative to the scene"
     if found := row.formation:
         model = MODELS.get(found["model"], found["model"])
         if found["model"] == "none":
             yield "formation", model
         else:
             share = f"{100 * found['explained']:.0f} %"
-            yield "formation", f"{model}, which takes away {share} of the frame's misfit"
+            yield "formation", f"{model}, explains {share} of the misfit"
             lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
             yield "", ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
-        yield "weight", f"{found['weight_before']:.2f} before, {found['weight_after']:.2f} after it"
+        yield (
+            "weight",
+            f"{found['weight_before']:.2f} before image formation, {found['weight_after']:.2f} after it",
+        )
     for choice in row.rounds:
         refused = ", refused" if not choice.accepted and choice.chosen != "observed" else ""
         yield f"round {choice.round}", f"{CHOICES[choice.chosen]}{refused} ({choice.reason})"
@@ -515,7 +521,7 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple
 
 
 def _column_row(column: str, facts: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Name, figures in words and meaning of a column of `describe_table`."""
+    """Return name, figures and meaning of a column from `describe_table`, as text."""
     if "counts" in facts:
         words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
     elif "median" in facts:
@@ -527,10 +533,13 @@ def _column_row(column: str, facts: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:
-    """Print a table without lines; one without ``columns`` has labels in its first.
+    """Print a table without lines. Brackets in cells are not treated as markup.
 
-    wraps: the only column whose cells may take several lines; the columns then stand closer. Brackets in
-    names are no markup.
+    Args:
+        rows: The cells.
+        columns: The heads. Without them, the first column holds labels.
+        title: The line above the table.
+        wraps: Head of the only column whose cells may wrap; the columns are then closer together.
     """
     gap = (0, 1 if wraps else 2, 0, 0)
     table = Table(*columns, box=None, header_style="bold", padding=gap, pad_edge=False)

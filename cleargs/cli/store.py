@@ -1,4 +1,4 @@
-"""``cleargs verify`` and ``gc``: the files of a run and its store, read again or cleared away."""
+"""``cleargs verify`` and ``gc``: check the files of a run, or remove unused ones from a store."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class StoreFault(NamedTuple):
 @click.command(
     epilog="""\b
 Example:
-  cleargs verify room      before an archive is trusted, or after a disk was
+  cleargs verify room      after a disk error, or before you archive a run
 """
 )
 @run_argument
@@ -38,11 +38,10 @@ Example:
 @json_option
 @click.pass_obj
 def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
-    """Read every file that RUN shows, and every input that it was made from, and compare them with the
-    digests in its manifests.
+    """Check every file of RUN, and every input of it, against the digests in its manifests.
 
-    Other commands trust a file whose size and time stamps did not change. Damaged results are made again by
-    the next `cleargs run`. Exit code 1 when something is damaged or changed.
+    Other commands do not read a file again if its size and time stamps are unchanged. The next `cleargs run`
+    replaces damaged results. The exit code is 1 if something is damaged or changed.
     """
     settings = read_run_file(run, dag, store=store)
     faults: list[StoreFault] = []
@@ -52,7 +51,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
         for name in dag.names:
             folder = settings.folder / name
             if not folder.is_symlink() and not folder.exists():
-                continue  # not made yet; a copy of a run has folders in place of links
+                continue  # no results yet; a copy of a run has folders instead of links
             stages.append(name)
             try:
                 manifest = read_manifest(folder)
@@ -67,7 +66,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
             faults += _changed_inputs(dag, settings, opened, manifest)
     if not stages:
         raise InputError(f"{run} has no results yet", hint=f"first: cleargs run {settings.source} -o {run}")
-    found = count(len(faults), "fault") if faults else "all as they were made"
+    found = count(len(faults), "fault") if faults else "all unchanged"
     answer(
         as_json,
         {"stages": stages, "files": files, "faults": [fault._asdict() for fault in faults]},
@@ -75,17 +74,17 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
         f"{files} files of {len(stages)} stages read: {found}",
     )
     if any(fault.kind == "damaged" for fault in faults):
-        click.echo(f"hint: `cleargs run {settings.source} -o {run}` makes damaged results again", err=True)
+        click.echo(f"hint: replace damaged results with `cleargs run {settings.source} -o {run}`", err=True)
     return 1 if faults else 0
 
 
 def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) -> Iterator[StoreFault]:
-    """What differs between the files outside the store that a stage was made from, and those there now."""
+    """Yield the differences between the present inputs of a stage outside the store and its manifest."""
     stage = manifest.stage
     for role, place in dag.load(stage).externals(run.config.sections[stage], run.source).items():
         before = manifest.origins.get(role)
         if before is None:
-            continue  # the stage was made with other settings, which `cleargs status` tells
+            continue  # the stage ran with other settings, which `cleargs status` shows
         files = named_files(place)
         for name in sorted(before.keys() | files.keys()):
             change = None
@@ -106,7 +105,7 @@ def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) ->
 @click.command(
     epilog="""\b
 Examples:
-  cleargs gc room --dry-run         what would go
+  cleargs gc room --dry-run         show what would be removed
   cleargs gc --store /data/store    a store that several runs share
 """
 )
@@ -115,28 +114,28 @@ Examples:
 @click.option(
     "--checkpoints",
     is_flag=True,
-    help="Remove the checkpoints of interrupted work, and what is kept about single frames, too.",
+    help="Also remove checkpoints of interrupted work, and cached results of single frames.",
 )
-@click.option("--dry-run", is_flag=True, help="Only say what would be removed.")
+@click.option("--dry-run", is_flag=True, help="Only show what would be removed.")
 @json_option
 @click.pass_obj
 def gc(
     dag: Dag, run: Path | None, store: Path | None, checkpoints: bool, dry_run: bool, as_json: bool
 ) -> None:
-    """Remove the results that no run links to, from the store of RUN or from --store.
+    """Remove the results that no run links to. The store is that of RUN, or --store.
 
-    A run counts as long as its folder exists where it was last used. Going back to settings whose results
-    were removed makes them again.
+    A run keeps its results as long as its folder exists where it was last used. If you return to settings
+    whose results were removed, the stages run again.
     """
     if run is None and store is None:
-        raise InputError("neither a run nor a store is named", hint="give RUN or --store DIR")
+        raise InputError("no run and no store is given", hint="give RUN or --store DIR")
     root = store if run is None else read_run_file(run, dag, store=store).store
     assert root is not None
     if not root.is_dir():
-        raise InputError(f"there is no store {root}", hint="give the folder that was passed as --store")
-    if run is None and not (root / ROOTS).is_dir():  # every run that uses a store is noted there
+        raise InputError(f"the store {root} does not exist", hint="give the folder that you used as --store")
+    if run is None and not (root / ROOTS).is_dir():  # a store lists its runs there
         raise InputError(
-            f"{root} is no store", hint="give the folder that was passed as --store, or RUN without --store"
+            f"{root} is not a store", hint="give the folder that you used as --store, or RUN without --store"
         )
     with opened_store(root) as opened:
         if run is not None and not dry_run:

@@ -1,4 +1,4 @@
-"""``cleargs synth``: captures with known truth."""
+"""``cleargs synth``: synthetic captures with known ground truth."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from cleargs.cli.common import json_option, parse_size, print_json
 from cleargs.cli.progress_bars import make_reporter
 
 PROTOCOL_HELP = (
-    "One of sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, gsotm-mb, gsotm-rs, "
-    "gsotm-mb-rs, gsotm-pn, camera, phone."
+    "Degradations: sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, gsotm-mb, gsotm-rs, "
+    "gsotm-mb-rs, gsotm-pn, camera or phone."
 )
 
 
@@ -20,17 +20,27 @@ PROTOCOL_HELP = (
     epilog="""\b
 Example:
   cleargs synth room --protocol mixed --frames 16 --size 480x270
-  cleargs run room -o run                        uses the given poses
-  cleargs run room -o run --set ingest.poses=sfm  starts from the images alone
+  cleargs run room -o run                         use the given poses
+  cleargs run room -o run --set ingest.poses=sfm  estimate the poses from the images
+
+\b
+Protocols, with mean lengths at a width of 640 px:
+  sharp                                  no degradation except a little noise
+  mixed                                  every other frame blurred, defocused or badly exposed
+  gs2e-slight, gs2e-medium, gs2e-severe  motion blur of 6, 12 and 20 px
+  gs2e-stretches                         motion blur of 14 px, almost all in groups of 12 frames
+  gsotm-mb, gsotm-rs, gsotm-mb-rs        motion blur of 8 px, rolling shutter of 12 px, or both
+  gsotm-pn                               sharp frames with inexact poses
+  phone                                  degradations of a phone's video
 """
 )
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--protocol", default="mixed", show_default=True, help=PROTOCOL_HELP)
 @click.option(
-    "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="How many frames."
+    "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="Number of frames."
 )
 @click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Another room and walk.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of room and path.")
 @click.option("--video", is_flag=True, help="Also write OUT/capture.mp4.")
 @json_option
 def synth(
@@ -44,8 +54,8 @@ def synth(
 ) -> None:
     """Make a synthetic handheld capture of a procedural room in the new folder OUT.
 
-    OUT/images and OUT/transforms.json are a capture like any other; OUT/truth holds the sharp views with
-    exact poses and depth, views off the path, and what is wrong with each frame.
+    OUT/images and OUT/transforms.json are the capture. OUT/truth holds the ground truth: sharp views with
+    exact poses and depth, views off the camera path, and the degradations of each frame.
     """
     from cleargs.synth.synthetic_capture import make_capture
 
@@ -66,18 +76,18 @@ def synth(
 
 
 def print_capture(out: Path, summary: dict[str, Any]) -> None:
-    """Say what `cleargs.synth.synthetic_capture.make_capture` made in ``out``."""
+    """Print the ``summary`` of `cleargs.synth.synthetic_capture.make_capture` for the capture in ``out``."""
     width = summary["width"]
     click.echo(
-        f"{summary['frames']} frames of {summary['protocol']!r} in {out}; the truth in {out / 'truth'}"
+        f"{summary['frames']} frames of {summary['protocol']!r} in {out}; ground truth in {out / 'truth'}"
     )
     click.echo(_line("true blur", summary["blur_px"], width))
     if summary["rolling_shutter_px"]["max"] > 0:
         click.echo(_line("true rolling-shutter skew", summary["rolling_shutter_px"], width))
     if (noise := summary["pose_noise"]) is not None:
         click.echo(
-            f"noise on the given poses: {noise['rotation_deg']:.2f} degrees about and "
-            f"{noise['translation']:.4f} world units along each axis"
+            f"noise of the given poses, per axis: {noise['rotation_deg']:.2f} degrees and "
+            f"{noise['translation']:.4f} world units"
         )
 
 

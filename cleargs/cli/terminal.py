@@ -14,30 +14,30 @@ from types import FrameType
 from cleargs.safe_io import printable
 
 GRACE_S = 1.0
-"""Time that the ordinary way out may take after Ctrl-C."""
+"""Time for an orderly exit after Ctrl-C."""
 
 SAVING_S = 20.0
-"""Time that it may take after SIGTERM: a training ends its step and saves a checkpoint."""
+"""Time for an orderly exit after SIGTERM: a training ends its step and saves a checkpoint."""
 
-INTERRUPTED = "interrupted; finished work is kept, and the same command resumes from there"
+INTERRUPTED_LINE = "interrupted: finished work is kept; give the same command again to resume"
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_COLOUR = re.compile(r"(\x1b\[[0-9;]*m)")  # of our own tables: it changes how the text after it looks
+_COLOUR = re.compile(r"(\x1b\[[0-9;]*m)")  # the escapes that ClearGS itself writes
 
 
-def answer_signals() -> None:
-    """Turn SIGINT and SIGTERM into KeyboardInterrupt, with a way out for when Python cannot raise it.
+def handle_signals() -> None:
+    """Turn SIGINT and SIGTERM into KeyboardInterrupt, and end the process if Python cannot raise it.
 
-    Python raises it only between two of its instructions, so a long call into compiled code would delay
-    it. A waiting thread then ends the process after `GRACE_S` or `SAVING_S`. That is safe for the results:
-    they survive kill -9 at any moment.
+    Python raises it only between two of its instructions, so a long call of compiled code delays it. A
+    waiting thread then ends the process after `GRACE_S` or `SAVING_S`. This is safe: results survive kill -9
+    at any moment.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
     def restore() -> None:
-        # A forked child shares the pipe: without this, ending it would end us.
+        # A forked child shares the pipe. Without this, a signal to the child would end its parent too.
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
@@ -45,10 +45,10 @@ def answer_signals() -> None:
         while True:
             if received := set(_SIGNALS).intersection(os.read(reader, 16)):
                 time.sleep(GRACE_S if signal.SIGINT in received else SAVING_S)
-                os.write(2, f"{INTERRUPTED}\n".encode())
+                os.write(2, f"{INTERRUPTED_LINE}\n".encode())
                 os._exit(130)
 
-    # A signal waits until all is in place. What was blocked before stays blocked.
+    # Signals wait until the handlers are installed. Signals that were blocked before stay blocked.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     os.register_at_fork(after_in_child=restore)
     for number in _SIGNALS:
@@ -61,9 +61,9 @@ def answer_signals() -> None:
 
 
 class EscapingStream(io.TextIOWrapper):
-    """A text stream that shows control and bidirectional characters instead of passing them on.
+    """A text stream that escapes control and bidirectional characters, so that names cannot steer a terminal.
 
-    Lines, tabs and colours stay. A character that the stream's encoding lacks is shown in the same way.
+    Line ends, tabs and colours stay. Characters that the encoding of the stream lacks are escaped too.
     """
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
@@ -84,7 +84,7 @@ class EscapingStream(io.TextIOWrapper):
 
 
 def protect_streams() -> None:
-    """Let ``sys.stdout`` and ``sys.stderr`` escape; streams that somebody else put there are left alone."""
+    """Replace ``sys.stdout`` and ``sys.stderr`` by escaping streams, unless other code has replaced them."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, f"__{name}__")
         if isinstance(stream, io.TextIOWrapper) and getattr(sys, name) is stream:

@@ -16,6 +16,7 @@ from cleargs.formation.exposure import apply_affine
 from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model, widened
 from cleargs.formation.search import preferred, refine, search
 from cleargs.formation.warp import displacement_fields
+from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
@@ -104,15 +105,15 @@ def fit_motion(
     margin = margin_for(reach, camera)
     rendered = render(widened(camera, margin))
     pair = frame_pair(rendered, affine, target, mask, camera, margin)
-    known = _scaled(frame.motion, factor)
+    known, kernels = _scaled(frame.motion, factor), backend_for(rendered.image.device)
     if warm:
-        found = refine(pair, frame.model, known, pose=config.pose)
+        found = refine(pair, frame.model, known, pose=config.pose, kernels=kernels)
         best = found[-1]
     else:
-        found = search(pair, skew=rolling or test_rolling, pose=config.pose)
+        found = search(pair, skew=rolling or test_rolling, pose=config.pose, kernels=kernels)
         frame = replace(frame, skew_gain=_skew_gain(found) if rolling or test_rolling else None)
         if frame.model != "none":
-            found += refine(pair, frame.model, known, pose=config.pose)[1:]
+            found += refine(pair, frame.model, known, pose=config.pose, kernels=kernels)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
     # Hysteresis: what was taken before may stay at half the gain that lets a model in.
     if best.explained < config.accept * (0.5 if frame.model == best.model else 1.0):

@@ -1,7 +1,7 @@
-"""The frozen restoration expert of RIVR: an image in, a sharper image of the same size out.
+"""The frozen restoration expert of RIVR: it maps an image to a sharper image of the same size.
 
-Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embedded default is the network of
-`tools/train_models/train_restorer.py`.
+Any restoration network in an ONNX file can be used: NCHW or NHWC, fixed or free size. The embedded default
+was trained by `tools/train_models/train_restorer.py`.
 """
 
 from __future__ import annotations
@@ -23,23 +23,30 @@ class Expert(Protocol):
 
     @property
     def name(self) -> str:
-        """A short name for tables."""
+        """Short name for tables."""
 
     @property
     def digest(self) -> str:
-        """Identifies the weights; part of the store key."""
+        """Digest of the weights, part of the store key."""
 
     def restore(self, image: ImageF32, *, threads: int = 1) -> ImageF32:
-        """The restored image, of the same bits for any ``threads``: [H, W, 3] float32 sRGB in [0, 1]."""
+        """Restore an image [H, W, 3] float32 sRGB in [0, 1]; ``threads`` does not change any bit."""
 
 
 class OnnxExpert:
-    """A restoration network in an ONNX file, run on overlapping tiles: on a GPU on several at a time.
+    """A restoration network in an ONNX file, applied to overlapping tiles (on a GPU in batches).
 
-    The model takes one image as [1, 3, H, W] or [1, H, W, 3] float32 in [0, 1] and returns one of the same
-    size in either layout; of several outputs the first counts. Sides that the model fixes become the tiles'.
+    The network maps an image [1, 3, H, W] or [1, H, W, 3], float32 sRGB in [0, 1], to an image of the same
+    size in either layout. Its first output is used. If it has a fixed input size, that is the size of the
+    tiles.
 
-    Raises InputError when the file is missing, no ONNX model, or of another form.
+    Args:
+        path: ONNX file.
+        name: Name for tables (None: the file name without its extension).
+        device: Device of the network, as `network_device` returns it.
+
+    Raises:
+        InputError: The file is missing, is not an ONNX model, or has other inputs.
     """
 
     def __init__(self, path: Path, name: str | None = None, device: Device = "cpu") -> None:
@@ -48,7 +55,7 @@ class OnnxExpert:
         if len(shape) != 4 or shape[0] not in (None, 1) or 3 not in (shape[1], shape[3]):
             raise InputError(
                 f"{path} does not take one RGB image: its inputs are {[info.shape for info in model.inputs]}",
-                hint="a restoration model takes [1, 3, H, W] or [1, H, W, 3]",
+                hint="use a restoration model that takes [1, 3, H, W] or [1, H, W, 3]",
             )
         if model.inputs[0].dtype != "float":
             raise InputError(
@@ -62,36 +69,42 @@ class OnnxExpert:
         self.digest = model.digest
 
     def restore(self, image: ImageF32, *, threads: int = 1) -> ImageF32:
-        """See `Expert.restore`. Raises StageError when the model returns values that are not finite."""
+        """Restore an image, as `Expert.restore`; raise StageError if the result is not finite."""
         restored = map_tiled(
             lambda tiles: self._model.map(self._restore, tiles, threads), image, fixed=self._fixed
         )
         if not np.isfinite(restored).all():
             raise StageError(
                 f"the restoration expert {self.name} returned values that are not finite",
-                hint="check the model file, or set rivr.expert to another one",
+                hint="check the model file, or set rivr.expert to another model",
             )
         return np.clip(restored, np.float32(0.0), np.float32(1.0))
 
     def _restore(self, tiles: ImageF32) -> ImageF32:
-        """Tiles [N, h, w, 3], restored."""
+        """Restore tiles [N, h, w, 3]."""
         batch = tiles.transpose(0, 3, 1, 2) if self._channels_first else tiles
         output = self._model.run(np.ascontiguousarray(batch, np.float32))[0]
         restored = output.transpose(0, 2, 3, 1) if output.ndim == 4 and output.shape[1] == 3 else output
         if restored.shape != tiles.shape:
             raise InputError(
                 f"the restoration expert {self.name} maps {tiles.shape} to {output.shape}",
-                hint="a restoration model returns an image of the same size",
+                hint="use a restoration model that returns an image of the same size",
             )
         return np.asarray(restored, np.float32)
 
 
 def load_expert(spec: str, device: Device = "cpu") -> Expert:
-    """The expert named by ``spec`` (see `load_network`), on what `network_device` found. Raises InputError,
-    also as `OnnxExpert` does.
+    """Load the expert that a setting names.
+
+    Args:
+        spec: Value of the setting ``rivr.expert``: a model of the registry, an ONNX file, or a part.
+        device: Device of the network, as `network_device` returns it.
+
+    Raises:
+        InputError: The expert is unknown, not installed or unusable.
     """
 
-    def own(path: Path, model: RegistryEntry | None) -> Expert:
+    def from_file(path: Path, model: RegistryEntry | None) -> Expert:
         return OnnxExpert(path, None if model is None else spec, device)
 
-    return load_network(spec, "expert", device, own)
+    return load_network(spec, "expert", device, from_file)

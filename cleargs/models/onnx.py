@@ -1,7 +1,7 @@
-"""ONNX models on onnxruntime: on the CPU one thread a call, so that results never depend on the thread count.
+"""ONNX models on onnxruntime. CPU calls use one thread, so results do not depend on the thread count.
 
-Parallelism is over the items of `OnnxModel.map` (image tiles, say): on the CPU several threads take one item
-each, and every call computes the same bits; on a GPU one call takes several items.
+`OnnxModel.map` is parallel over its items, for example image tiles. On the CPU several threads process one
+item each. On a GPU one call processes several items.
 """
 
 from __future__ import annotations
@@ -30,54 +30,58 @@ Device = Literal["cpu", "cuda"]
 CUDA_PROVIDER = "CUDAExecutionProvider"
 
 BATCH_PIXELS = 8 * 512 * 512
-"""Pixels of a batch, at most."""
+"""Maximum number of pixels in a batch."""
 
-_EXHAUSTED = ("bad_alloc", "allocate memory", "out of memory", "alloc_failed")
-"""How onnxruntime, CUDA and cuDNN say it; onnxruntime has no exception of its own for it."""
+_MEMORY_ERRORS = ("bad_alloc", "allocate memory", "out of memory", "alloc_failed")
+"""Texts of onnxruntime, CUDA and cuDNN for exhausted memory; onnxruntime has no exception class for it."""
 
 _FATAL = 4
 _EXTERNAL_FOLDER = "session.model_external_initializers_file_folder_path"
-"""Where onnxruntime looks for weights that a model given as bytes keeps outside."""
+"""Option for the folder of external weights, for a model that is given as bytes."""
 
 _CUDA_OPTIONS = {
-    "use_tf32": "0",  # ten bits of mantissa would be too few to compare scores by
-    "cudnn_conv_algo_search": "HEURISTIC",  # a search by time may end with another algorithm each time
-    "arena_extend_strategy": "kSameAsRequested",  # the splatting shares the GPU's memory
+    "use_tf32": "0",  # its mantissa of 10 bits is too short to compare scores
+    "cudnn_conv_algo_search": "HEURISTIC",  # a search by time may select a different algorithm in each run
+    "arena_extend_strategy": "kSameAsRequested",  # the splatting kernels share the GPU's memory
 }
 
 
 RUNTIMES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino")
-"""Distributions that bring the module onnxruntime, each with its own providers."""
+"""Distributions that provide the module onnxruntime, with different providers."""
 
 
 def installed_runtimes() -> str:
-    """The installed ones with their versions; "absent" without one."""
+    """Return the installed distributions of `RUNTIMES` with their versions, or "absent"."""
     versions = {name: installed_version(name) for name in RUNTIMES}
     return ", ".join(f"{name} {found}" for name, found in versions.items() if found != "absent") or "absent"
 
 
 @cache
 def runtime_version(device: Device) -> str:
-    """The installed runtimes with the device that runs the networks. On a GPU, only a trial tells it."""
+    """Return the installed runtimes with the device that runs the networks (see `network_device`)."""
     return f"{installed_runtimes()}, on {network_device(device, lambda warning: None)}"
 
 
 def network_device(device: Device, warn: Callable[[str], None]) -> Device:
-    """Where onnxruntime can run the networks of work on ``device``.
+    """Return the device on which onnxruntime can run networks, which a trial determines.
 
-    That is the GPU only where onnxruntime's CUDA provider is there and loads; where not, ``warn`` is told
-    why, once, and the CPU serves.
+    Args:
+        device: Device of the run.
+        warn: Function that receives a warning if the run uses a GPU but onnxruntime cannot.
+
+    Returns:
+        ``cuda`` if ``device`` is ``cuda`` and onnxruntime's CUDA provider is present and loads, else ``cpu``.
     """
     if device == "cpu":
         return "cpu"
     import onnxruntime
 
     if CUDA_PROVIDER not in onnxruntime.get_available_providers():
-        warn("experts and scorers run on the CPU: onnxruntime has no CUDA provider (onnxruntime-gpu has)")
+        warn("experts and scorers run on the CPU: onnxruntime has no CUDA provider (onnxruntime-gpu has one)")
         return "cpu"
     if hasattr(onnxruntime, "preload_dlls"):
         with redirect_stdout(StringIO()):
-            onnxruntime.preload_dlls()  # finds the libraries of CUDA that came with PyTorch
+            onnxruntime.preload_dlls()  # finds the CUDA libraries that PyTorch includes
     probe = Path(str(files("cleargs.models"))) / "weights" / "scorer.onnx"
     if OnnxModel(probe, device).device == "cpu":
         warn("experts and scorers run on the CPU: onnxruntime's CUDA provider does not load")
@@ -87,19 +91,25 @@ def network_device(device: Device, warn: Callable[[str], None]) -> Device:
 
 @dataclass(frozen=True)
 class TensorInfo:
-    """Name, shape (None where free) and element type (``float``, ``float16``...) of an input or output."""
+    """An input or output of a model."""
 
     name: str
-    shape: tuple[int | None, ...]
-    dtype: str
+    shape: tuple[int | None, ...]  # None: free
+    dtype: str  # element type: ``float``, ``float16``...
 
 
 class OnnxModel:
-    """An ONNX file ready to run, on the CPU where the GPU's provider does not load (see `network_device`).
+    """An ONNX file, loaded by onnxruntime. It runs on the CPU if the GPU's provider does not load.
 
-    The model is the file and nothing else: weights that it keeps in other files are in no digest and would
-    change unseen. Raises InputError when the file is missing, refers to other files, or is not an ONNX model
-    that onnxruntime can run; MemoryError when the model does not fit.
+    The file must contain all weights, because the digest does not cover other files.
+
+    Args:
+        path: ONNX file.
+        device: Device to run on, as `network_device` returns it.
+
+    Raises:
+        InputError: The file is missing, refers to other files, or is not a model that onnxruntime can run.
+        MemoryError: The model does not fit into memory.
     """
 
     def __init__(self, path: Path, device: Device = "cpu") -> None:
@@ -115,26 +125,26 @@ class OnnxModel:
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
         options.use_deterministic_compute = True
-        options.log_severity_level = _FATAL  # what goes wrong is raised, and told once
-        options.add_session_config_entry(_EXTERNAL_FOLDER, os.devnull)  # nothing can lie in there
+        options.log_severity_level = _FATAL  # errors are raised, so they need no log
+        options.add_session_config_entry(_EXTERNAL_FOLDER, os.devnull)  # no folder, so no external weights
         session = None
-        if device == "cuda":  # the provider may not load, which onnxruntime also prints on stdout
+        if device == "cuda":  # the provider may not load, and onnxruntime prints that to stdout
             providers = [(CUDA_PROVIDER, _CUDA_OPTIONS), "CPUExecutionProvider"]
             with suppress(Exception), redirect_stdout(StringIO()):
                 session = onnxruntime.InferenceSession(model, options, providers=providers)
         try:
             if session is None:
                 session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's exceptions share no base class of their own
+        except Exception as error:  # onnxruntime's exceptions have no common base class
             _raise_exhausted(path, error)
-            reason = "it keeps weights in other files" if "xternal data" in str(error) else _reason(error)
+            reason = "it stores weights in other files" if "xternal data" in str(error) else _reason(error)
             raise InputError(
                 f"{path} is not an ONNX model that can be run: {reason}",
                 hint="export the model again as a single ONNX file with standard operators",
             ) from error
         self.path = path
         self.digest = hashlib.sha256(model).hexdigest()
-        """SHA-256 of the file in hexadecimal."""
+        """SHA-256 of the file, hexadecimal."""
         self.device: Device = "cuda" if CUDA_PROVIDER in session.get_providers() else "cpu"
         self.inputs = _describe(session.get_inputs())
         self.outputs = _describe(session.get_outputs())
@@ -142,18 +152,20 @@ class OnnxModel:
 
     @property
     def takes_batches(self) -> bool:
-        """Whether several items a call are possible, and worth it: on a GPU, where the first axis is free."""
+        """True if `map` runs several items per call: on a GPU, if the first axis of all inputs is free."""
         return self.device == "cuda" and all(info.shape[:1] == (None,) for info in self.inputs)
 
     def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
-        """All outputs for the given inputs, in the model's order. Several threads may call this at once.
+        """Return all outputs for the given inputs, both in the model's order. The method is thread-safe.
 
-        Raises MemoryError, and StageError for whatever else onnxruntime stops at.
+        Raises:
+            MemoryError: The computation does not fit into memory.
+            StageError: onnxruntime failed for another reason.
         """
         feeds = {info.name: tensor for info, tensor in zip(self.inputs, tensors, strict=True)}
         try:
             outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
-        except Exception as error:  # onnxruntime's exceptions share no base class of their own
+        except Exception as error:  # onnxruntime's exceptions have no common base class
             _raise_exhausted(self.path, error)
             raise StageError(
                 f"the model {self.path.name} failed: {_reason(error)}",
@@ -167,10 +179,12 @@ class OnnxModel:
         items: Sequence[NDArray[np.float32]],
         threads: int,
     ) -> Iterator[Any]:
-        """The results of ``function`` for ``items`` [H, W, C] of one size, in their order.
+        """Apply ``function`` to all items, and yield the results in their order.
 
-        function: maps a stack [N, H, W, C] to results [N, ...] by calling `run` once.
-        threads: items at once on the CPU. On a GPU a batch is as large as fits.
+        Args:
+            function: Function that maps a batch [N, H, W, C] to results [N, ...] with one call of `run`.
+            items: Arrays [H, W, C] of the same size.
+            threads: Number of items at the same time on the CPU. On a GPU a batch is as large as fits.
         """
         if self.takes_batches:
             yield from in_batches(function, items)
@@ -182,10 +196,12 @@ class OnnxModel:
 def in_batches(
     function: Callable[[NDArray[np.float32]], NDArray[np.float32]], items: Sequence[NDArray[np.float32]]
 ) -> list[Any]:
-    """The results of ``function`` for ``items`` [H, W, ...] of one size, in their order.
+    """Return the results of ``function`` for ``items`` [H, W, ...] of the same size, computed in batches.
 
-    A batch that the GPU's memory does not hold is tried again by halves. Raises StageError when a single item
-    is too large.
+    If a batch does not fit into the GPU's memory, the batch size is halved.
+
+    Raises:
+        StageError: A single item is too large.
     """
     pixels = items[0].shape[0] * items[0].shape[1]
     size = max(1, BATCH_PIXELS // pixels)
@@ -197,7 +213,7 @@ def in_batches(
         except MemoryError as error:
             if len(batch) == 1:
                 raise StageError(
-                    f"the GPU's memory does not hold a network's work on {pixels} pixels",
+                    f"the GPU's memory does not hold the data of a network for {pixels} pixels",
                     hint="free memory on the GPU, or use --device cpu",
                 ) from error
             size = len(batch) // 2
@@ -205,8 +221,8 @@ def in_batches(
 
 
 def _raise_exhausted(path: Path, error: Exception) -> None:
-    """Raise MemoryError if that is what onnxruntime reports."""
-    if any(words in str(error).lower() for words in _EXHAUSTED):
+    """Raise MemoryError if onnxruntime reports exhausted memory."""
+    if any(words in str(error).lower() for words in _MEMORY_ERRORS):
         raise MemoryError(f"{path.name}: {_reason(error)}") from error
 
 

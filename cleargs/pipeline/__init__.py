@@ -1,1 +1,1 @@
-"""The runner and its store: which stage must run, where its results lie, and why. Knows nothing of splats."""
+"""The runner and the store of results. They decide which stages run; they know nothing of splats."""

@@ -1,6 +1,6 @@
-"""The configuration of a run: a recipe merged over the defaults, then single settings, checked by each stage.
+"""The configuration of a run: defaults, then a recipe, then single settings, checked by each stage's model.
 
-A document has one table a stage, and beside them ``seed``. What a stage may be told is its CONFIG model.
+A document has one table per stage, and ``seed``. The CONFIG model of a stage declares its settings.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from cleargs.pipeline.settings import Setting, flattened, settings_of, suggestio
 from cleargs.safe_io import FAULTS, cause, read_text
 
 RECIPES = "cleargs.workflows"
-"""The package that holds the recipes known by name."""
+"""The package with the recipes that have a name."""
 
 MAX_SEED = 2**63 - 1
+"""The largest signed integer of 64 bits, which is the largest integer in TOML."""
 
 Document = dict[str, Any]
 
@@ -34,17 +35,17 @@ class Config:
 
     seed: int
     sections: Mapping[str, BaseModel]
-    """Stage -> its settings, defaults filled in."""
+    """Stage -> its settings, with the defaults filled in."""
 
     def document(self) -> Document:
-        """The full configuration as TOML holds it (settings that are None are left out)."""
+        """Return the full configuration for TOML, which has no null: settings that are None are left out."""
         tables = {
             name: model.model_dump(mode="json", exclude_none=True) for name, model in self.sections.items()
         }
         return {"seed": self.seed, **tables}
 
     def settings(self) -> Iterator[tuple[Setting, Any]]:
-        """Each setting of the stages, and its value as JSON holds it."""
+        """Yield each setting of the stages, and its value as a JSON value."""
         for section, model in self.sections.items():
             values = dict(flattened({section: model.model_dump(mode="json")}))
             yield from ((setting, values[setting.name]) for setting in settings_of(section, type(model)))
@@ -56,10 +57,16 @@ def load_config(
     overrides: Sequence[str] = (),
     seed: int | None = None,
 ) -> Config:
-    """The configuration of ``recipe`` (a name, a TOML file, or a document) with each ``a.b=value`` of
-    ``overrides`` on top.
+    """Return the checked configuration of a recipe.
 
-    Raises ConfigError: unknown recipe, TOML that cannot be read, unknown setting, value out of range.
+    Args:
+        dag: The stages, whose models check the settings.
+        recipe: A name, the path of a TOML file, or a document.
+        overrides: Settings as ``a.b=value``, which replace those of the recipe; the last one wins.
+        seed: Seed that replaces the recipe's.
+
+    Raises:
+        ConfigError: The recipe is unknown or cannot be read, or a setting is unknown or out of range.
     """
     document = read_recipe(recipe) if isinstance(recipe, str) else recipe
     for text in overrides:
@@ -70,26 +77,26 @@ def load_config(
 
 
 def read_recipe(recipe: str) -> Document:
-    """The document of a recipe known by name, or of the TOML file at the path ``recipe``."""
+    """Return the document of the named recipe, or of the TOML file at the path ``recipe``."""
     if recipe.endswith(".toml") or "/" in recipe:
         return read_toml(Path(recipe))
     names = recipe_names()
     if recipe not in names:
         raise ConfigError(
-            f"there is no workflow {recipe!r}",
-            hint=did_you_mean(recipe, names, f"choose {', '.join(names)}, or give a .toml file"),
+            f"there is no recipe {recipe!r}",
+            hint=did_you_mean(recipe, names, f"choose one of {', '.join(names)}, or give a .toml file"),
         )
     return parse_toml(files(RECIPES).joinpath(f"{recipe}.toml").read_text(encoding="utf-8"), f"{recipe}.toml")
 
 
 def recipe_names() -> list[str]:
-    """Recipes known by name."""
+    """Return the names of the recipes that have one."""
     names = (entry.name for entry in files(RECIPES).iterdir())
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
 def read_toml(path: Path) -> Document:
-    """Read a TOML file. Raises ConfigError when it cannot be read."""
+    """Read a TOML file. Raises ConfigError if it cannot be read."""
     try:
         text = read_text(path)
     except FAULTS as error:
@@ -100,7 +107,7 @@ def read_toml(path: Path) -> Document:
 
 
 def parse_toml(text: str, name: str) -> Document:
-    """Parse TOML; ``name`` stands in the error."""
+    """Parse TOML. ``name`` is the file name for the message of a ConfigError."""
     try:
         return tomllib.loads(text)
     except FAULTS as error:  # TOMLDecodeError is a ValueError
@@ -110,12 +117,12 @@ def parse_toml(text: str, name: str) -> Document:
 
 
 def parse_override(text: str) -> Document:
-    """``a.b=value`` as a document. The value is TOML; what is no TOML value is taken as a string."""
+    """Return the document of ``a.b=value``. A value that is not valid TOML is used as a string."""
     name, equals, value = text.partition("=")
     parts = [part.strip() for part in name.split(".")]
     if not equals or not all(parts):
         raise ConfigError(
-            f"--set {text!r} is not of the form a.b=value", hint="write --set rva.tau_R=0.7, say"
+            f"--set {text!r} does not have the form a.b=value", hint="example: --set rva.tau_R=0.7"
         )
     document = {parts.pop(): _toml_value(value.strip())}
     for part in reversed(parts):
@@ -132,7 +139,7 @@ def _toml_value(text: str) -> Any:
 
 
 def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> Document:
-    """``base`` with the values of ``top`` in place of its own; tables are merged, lists replaced."""
+    """Return ``base`` with the values of ``top`` in place of its own. Merges tables, replaces lists."""
     merged = dict(base)
     for name, value in top.items():
         below = merged.get(name)
@@ -141,7 +148,7 @@ def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> Document:
 
 
 def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
-    """Check a document against the stages' models and fill in the defaults. Raises ConfigError."""
+    """Check a document with the stages' models and fill in the defaults. Raises ConfigError."""
     seed = document.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise ConfigError(
@@ -150,7 +157,7 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
     models = {name: dag.load(name).CONFIG for name in dag.names}
     for name in document:
         if name != "seed" and name not in models:
-            raise _unknown(name, models)
+            raise _unknown_setting(name, models)
     sections: dict[str, BaseModel] = {}
     for name, model in models.items():
         try:
@@ -163,41 +170,41 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
 def _setting_error(
     section: str, models: Mapping[str, type[BaseModel]], error: ValidationError
 ) -> ConfigError:
-    """The first complaint of pydantic as one line of cause and one of remedy."""
+    """Return the error for the first fault that pydantic found."""
     first = error.errors(include_url=False)[0]
     name = ".".join([section, *map(str, first["loc"])])
     if first["type"] == "retired":
-        gone = first["ctx"]
+        retired = first["ctx"]
         return ConfigError(
-            f"{name}.{gone['name']} = {gone['value']!r} is no setting any more", hint=gone["hint"]
+            f"{name}.{retired['name']} = {retired['value']!r} is no longer a setting", hint=retired["hint"]
         )
     if first["type"] == "extra_forbidden":
-        return _unknown(name, models)
+        return _unknown_setting(name, models)
     known = {setting.name: setting for setting in settings_of(section, models[section])}
     if first["type"] == "model_type":
         inner = next(full for full in known if full.startswith(f"{name}."))
         return ConfigError(
-            f"{name} = {first['input']!r} cannot be used",
-            hint=f"{name} is a table of settings: name one of them, {inner} say",
+            f"{name} = {first['input']!r} cannot be used: {name} is a table of settings",
+            hint=f"set one of them, for example {inner}",
         )
     message = first["msg"].removeprefix("Value error, ")
-    # Below a setting pydantic names the item of a list, or which member of a union it tried.
-    setting = next((known[place] for place in _places(name) if place in known), None)
+    # Pydantic's location may go further than the setting: to the item of a list or the member of a union.
+    setting = next((known[place] for place in _prefixes(name) if place in known), None)
     if setting is None:
         return ConfigError(f"{name}: {message}", hint=f"change the settings of [{name}]")
-    # A validator of ours says more than the type does.
+    # The message of a ClearGS validator says more than the type.
     own = first["type"] == "value_error"
     hint = message[:1].lower() + message[1:] if own else f"allowed: {setting.allowed}"
     return ConfigError(f"{setting.name} = {first['input']!r} cannot be used", hint=hint)
 
 
-def _unknown(name: str, models: Mapping[str, type[BaseModel]]) -> ConfigError:
-    """The error for a name that is no setting, with the one that was probably meant."""
+def _unknown_setting(name: str, models: Mapping[str, type[BaseModel]]) -> ConfigError:
+    """Return the error for an unknown setting, with a hint at the setting that the user probably meant."""
     settings = (setting.name for section, model in models.items() for setting in settings_of(section, model))
-    known = dict.fromkeys(place for full in ("seed", *settings) for place in _places(full))
+    known = dict.fromkeys(place for full in ("seed", *settings) for place in _prefixes(full))
     return ConfigError(f"there is no setting {name}", hint=suggestion(name, known))
 
 
-def _places(name: str) -> Iterator[str]:
-    """The stage of a dotted name, then its tables, then the name."""
+def _prefixes(name: str) -> Iterator[str]:
+    """Yield the stage of a dotted name, then its tables, then the full name."""
     return accumulate(name.split("."), "{}.{}".format)

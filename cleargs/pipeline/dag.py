@@ -1,4 +1,4 @@
-"""Which stages there are, and where they come from."""
+"""The stages in their order, and how they are loaded."""
 
 from __future__ import annotations
 
@@ -14,34 +14,39 @@ from cleargs.progress import Say
 
 @dataclass(frozen=True)
 class Dag:
-    """Stages in an order in which each comes after all that it reads, and how to load one by name."""
+    """The stages, in an order in which each comes after the stages that it reads."""
 
     names: tuple[str, ...]
     load: Callable[[str], Stage]
+    """Load a stage by name."""
     pace: Callable[[Say | None], float] = lambda say: 1.0
-    """This machine's time over what the stages' estimates were made for. It may take seconds to measure, and
-    is measured only where somebody is told (``say``)."""
+    """Return the time on this machine divided by the time on the machine that the estimates were made for.
+
+    With ``say``, the pace is measured unless it is known, which takes seconds, and ``say`` announces it.
+    """
+    gpu_fault: Callable[[BaseException], str | None] = lambda error: None
+    """Return in one line what failed on the GPU if that is the cause of an error, else None."""
 
     def check(self, name: str) -> str:
-        """``name``, when there is such a stage. Raises InputError with the nearest name otherwise."""
+        """Return ``name`` if it is a stage; raise InputError with the nearest name otherwise."""
         if name not in self.names:
             raise InputError(
                 f"there is no stage {name!r}",
-                hint=did_you_mean(name, self.names, f"the stages are {', '.join(self.names)}"),
+                hint=did_you_mean(name, self.names, f"choose one of {', '.join(self.names)}"),
             )
         return name
 
     def until(self, name: str | None) -> tuple[str, ...]:
-        """All stages up to and with ``name``; all of them for None."""
+        """Return all stages up to and including ``name``; all stages for None."""
         return self.names if name is None else self.names[: self.names.index(self.check(name)) + 1]
 
 
 def installed() -> Dag:
-    """The stages of the package ``cleargs.stages``. Each module is loaded when it is first asked for."""
+    """Return the stages of the package ``cleargs.stages``. A module is imported when it is first used."""
     package = import_module("cleargs.stages")
-    return Dag(tuple(package.STAGES), load_stage, package.pace)
+    return Dag(tuple(package.STAGES), load_stage, package.pace, package.gpu_fault)
 
 
 def load_stage(name: str) -> Stage:
-    """The module ``cleargs.stages.<name>``."""
+    """Import the module ``cleargs.stages.<name>``."""
     return cast(Stage, import_module(f"cleargs.stages.{name}"))

@@ -1,4 +1,4 @@
-"""The key of a stage: one digest of everything that decides its results, and of nothing else.
+"""The key of a stage: a digest of everything that decides its results, and of nothing else.
 
 Not in a key: paths, host, time, number of threads, log level.
 """
@@ -16,15 +16,15 @@ from cleargs.pipeline.settings import fields_of, flattened
 from cleargs.pipeline.stage import Device, Stage
 from cleargs.plugins import ExtensionPoint, installed_version, package_of, plugins
 
-UPSTREAM = "of "
-"""How the name of a table begins that holds the settings of another stage."""
+UPSTREAM_PREFIX = "of "
+"""Prefix of a table in the key that holds the settings of another stage."""
 
 
 def key_config(config: BaseModel) -> dict[str, Any]:
-    """The settings that enter the key, as JSON values.
+    """Return the settings that are part of the key, as JSON values.
 
-    A field declared with ``Field(..., json_schema_extra={"key": False})`` stays out. That is for settings
-    that only name a file, whose content enters the key through the stage's ``externals``.
+    A field with ``json_schema_extra={"key": False}`` is left out. Such a setting only names a file, whose
+    content is part of the key through the stage's ``externals``.
     """
     kept: dict[str, Any] = {}
     plain = config.model_dump(mode="json")
@@ -38,22 +38,22 @@ def key_config(config: BaseModel) -> dict[str, Any]:
 
 
 def stage_key_config(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> dict[str, Any]:
-    """The settings that enter the key of the stage ``name``, those of other stages in tables of their own."""
-    inherited = {f"{UPSTREAM}{other}": key_config(sections[other]) for other in stage.SETTINGS}
+    """Return the settings in the key of the stage ``name``, with one table per stage in `Stage.SETTINGS`."""
+    inherited = {f"{UPSTREAM_PREFIX}{other}": key_config(sections[other]) for other in stage.SETTINGS}
     return {**key_config(sections[name]), **inherited}
 
 
 def library_versions(stage: Stage, device: Device) -> dict[str, str]:
-    """What computes in ``stage`` on ``device``: name -> installed version."""
+    """Return name -> installed version of the libraries that affect results of ``stage`` on ``device``."""
     versions = {name: installed_version(name) for name in stage.LIBRARIES}
     other = getattr(stage, "other_libraries", None)
     return versions if other is None else versions | other(device)
 
 
 def plugin_versions(config: BaseModel) -> dict[str, str]:
-    """What other packages bring to the settings: "DISTRIBUTION for SETTING=NAME" -> installed version.
+    """Return "DISTRIBUTION for SETTING=NAME" -> installed version, for each plugin that the settings name.
 
-    A field that may name such a part is declared with ``json_schema_extra={"plugin": SOCKET}``.
+    A field that may name a plugin is declared with ``json_schema_extra={"plugin": EXTENSION_POINT}``.
     """
     versions: dict[str, str] = {}
     for name, field, value in fields_of(config):
@@ -72,16 +72,21 @@ def differences(
     old_files: Mapping[str, Mapping[str, str]],
     new_files: Mapping[str, Mapping[str, str]],
 ) -> list[str]:
-    """What changed between two sets of parts, one readable line each; empty when the keys are equal.
+    """Return one readable line per difference between two keys.
 
-    ``old_files`` and ``new_files`` map "STAGE/PATH" (inputs) or a role (externals) to the digests of the
-    single files behind it, so that a change names the file.
+    Args:
+        old: The parts of the first key.
+        new: The parts of the second key.
+        old_files: For the first key: "STAGE/PATH" (an input) or a role (an external) -> file -> digest.
+        new_files: The same for the second key. With both, a line can name the files that changed.
     """
     lines = []
     if old.version != new.version:
         lines.append(f"stage version: {old.version} -> {new.version}")
     for name, before, after in _changes(dict(flattened(old.config)), dict(flattened(new.config))):
-        own = name.removeprefix(UPSTREAM) if name.startswith(UPSTREAM) else f"{new.stage}.{name}"
+        own = (
+            name.removeprefix(UPSTREAM_PREFIX) if name.startswith(UPSTREAM_PREFIX) else f"{new.stage}.{name}"
+        )
         lines.append(f"setting {own}: {_show(before)} -> {_show(after)}")
     inputs = [("input", name) for name, _, _ in _changes(_input_digests(old), _input_digests(new))]
     externals = [("external", name) for name, _, _ in _changes(old.externals, new.externals)]
@@ -96,7 +101,7 @@ def differences(
 
 
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Name, value before and value after of each entry that differs; "(none)" where it is not there."""
+    """Yield name, old value and new value of each entry that differs; "(none)" replaces a missing value."""
     for name in sorted(old.keys() | new.keys()):
         before, after = old.get(name, "(none)"), new.get(name, "(none)")
         if before != after:
@@ -117,7 +122,7 @@ def _show(value: Any) -> str:
 
 
 def _changed_files(old: Mapping[str, str], new: Mapping[str, str], limit: int = 3) -> str:
-    """The first few changed files as ": a.png changed, b.png added"; " changed" for a single file."""
+    """Return the first few changed files as ": a.png changed, b.png added"; " changed" for a single file."""
     names = [name for name, _, _ in _changes(old, new) if name]
     if not names:
         return " changed"

@@ -1,6 +1,6 @@
-"""The progress of a run at work, for `cleargs watch` and `show`: a note in the run folder.
+"""Progress of an active run: a small file in the run folder, which `cleargs watch` and `show` read.
 
-Nothing rests on the note: no key, no output, no decision. A note that cannot be written stops no work.
+Results do not depend on this file. If it cannot be written, the run continues.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from cleargs.safe_io import FAULTS, read_json
 
 PROGRESS_FILE = ".at_work.json"
 
-EVERY = 2.0
-"""Seconds between two notes."""
+WRITE_INTERVAL_S = 2.0
+"""Seconds between two writes of the progress file, at least."""
 
 
 class RunningStage(FrozenModel):
-    """The progress of a stage."""
+    """Progress of a stage."""
 
     stage: str
     work: str = Field(pattern=r"^[^/\x00]+$")
     """Name of its work folder in the store."""
     label: str
-    """The present task."""
+    """The current task."""
     done: int = 0
     total: int | None = None
     note: str = ""
     """A few figures: PSNR, Gaussians."""
     seconds_left: float | None = None
-    """Of the present task."""
+    """Time left for the current task."""
 
 
 def running_stage(run: Path, store: Path) -> RunningStage | None:
-    """The progress of the run in the folder ``run``; None when it is not at work, or died."""
+    """Return the progress of the run in the folder ``run``; None if no process is running it."""
     try:
         found = RunningStage.model_validate(read_json(run / PROGRESS_FILE))
     except FAULTS:  # ValidationError is a ValueError
@@ -55,15 +55,15 @@ class Preview(NamedTuple):
     """A picture of the work so far."""
 
     version: int
-    """Grows with every new one: the time stamp, ns."""
+    """Modification time in ns, which grows with every new picture."""
     path: Path
 
 
 def preview_of(found: RunningStage, store: Path) -> Preview | None:
-    """The youngest preview that the stage at work left; None where there is none."""
+    """Return the newest preview of the running stage; None if there is none."""
     previews = []
     for path in (store / "work" / found.work / "checkpoints").rglob(PREVIEW):
-        with suppress(OSError):  # replaced or removed meanwhile
+        with suppress(OSError):  # the stage replaced or removed it
             if path.is_file() and not path.is_symlink():
                 previews.append(Preview(path.stat().st_mtime_ns, path))
     return max(previews, default=None)
@@ -71,9 +71,15 @@ def preview_of(found: RunningStage, store: Path) -> Preview | None:
 
 @contextmanager
 def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[Reporter]:
-    """A reporter that passes everything on to ``reporter`` and notes in ``run`` the progress of ``stage``.
+    """Yield a reporter that forwards to ``reporter`` and writes the progress of ``stage`` into ``run``.
 
-    The note goes when the block ends.
+    The progress file is removed when the block ends.
+
+    Args:
+        reporter: Receives all tasks and messages.
+        run: The run folder.
+        stage: Name of the running stage.
+        work: Work folder of the stage in the store.
     """
     try:
         yield _RecordingReporter(
@@ -85,7 +91,7 @@ def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> 
 
 
 class _RecordingReporter:
-    """Passes on, and notes the task that advanced last."""
+    """Forward to a reporter, and write the task that advanced last to the progress file."""
 
     def __init__(self, reporter: Reporter, path: Path, first: RunningStage) -> None:
         self._reporter, self._path, self._first = reporter, path, first
@@ -95,7 +101,7 @@ class _RecordingReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         def show(done: int, note: str, left: float | None) -> None:
-            if time.monotonic() - self._written >= EVERY:
+            if time.monotonic() - self._written >= WRITE_INTERVAL_S:
                 now = {"label": label, "total": total, "done": done, "note": note, "seconds_left": left}
                 self._write(self._first.model_copy(update=now))
 
@@ -109,7 +115,7 @@ class _RecordingReporter:
 
 
 class _RecordingTask(CountedTask):
-    """One task, passed on and noted."""
+    """A task that forwards to another one and writes the progress file."""
 
     def __init__(self, task: Task, total: int | None, show: Show) -> None:
         super().__init__(total, show)

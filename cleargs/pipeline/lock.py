@@ -1,4 +1,7 @@
-"""File locks that end with their process. They save work; correctness rests on the rename that publishes."""
+"""File locks that end with their process.
+
+They avoid double work. Correctness does not depend on them: it comes from the rename that publishes a result.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,15 @@ from cleargs.progress import Reporter
 
 @contextmanager
 def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterator[bool | None]:
-    """Hold the lock file ``path`` (created when absent) for the block.
+    """Hold the lock file ``path`` for the block. The kernel releases the lock when the process ends.
 
-    Yields True, or None on a file system without locks. The kernel drops the lock when its process ends,
-    however it ends. Another holder is waited for; with ``wait=False`` the block runs with False instead.
+    Args:
+        path: The lock file; created if it does not exist.
+        shared: Take a lock that several processes may hold at the same time.
+        wait: Wait for another holder. Otherwise, the block runs without the lock.
+
+    Yields:
+        True with the lock, False without it, None on a file system without locks.
     """
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     while True:
@@ -27,11 +35,11 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             held = _acquire(handle, kind if wait else kind | fcntl.LOCK_NB)
-            there = None
+            present = None
             with suppress(FileNotFoundError):
-                there = path.stat().st_ino
-            if held and there != os.fstat(handle).st_ino:
-                continue  # its last holder removed the file while we waited: lock the new one
+                present = path.stat().st_ino
+            if held and present != os.fstat(handle).st_ino:
+                continue  # the last holder removed the file while this process waited: lock the new one
             yield held
             return
         finally:
@@ -39,10 +47,16 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
 
 
 @contextmanager
-def only_one(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
-    """Hold the lock file ``path`` of ``what``; wait while another process has it, and say which one.
+def exclusive_lock(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
+    """Hold the lock file ``path``; report another holder and wait for it.
 
-    Yields whether this process is alone: a file system without locks keeps nobody apart.
+    Args:
+        path: The lock file. The holder writes its process and host into it.
+        reporter: Receives the message about another holder.
+        what: Name of the locked work, for the message.
+
+    Yields:
+        True with the lock; False on a file system without locks, where other processes may do the same work.
     """
     with ExitStack() as stack:
         held = stack.enter_context(file_lock(path, wait=False))
@@ -50,16 +64,16 @@ def only_one(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
             holder = ""
             with suppress(OSError, UnicodeDecodeError):
                 holder = path.read_text(encoding="utf-8")
-            reporter.info(f"{what}: {holder or 'another process'} works on it; waiting")
+            reporter.info(f"{what}: {holder or 'another process'} works on it; waiting for it to end")
             held = stack.enter_context(file_lock(path))
         job = f" (Slurm job {os.environ['SLURM_JOB_ID']})" if os.environ.get("SLURM_JOB_ID") else ""
-        with suppress(OSError):  # the note only serves messages
+        with suppress(OSError):  # only messages use the note
             path.write_text(f"process {os.getpid()} on {socket.gethostname()}{job}", encoding="utf-8")
         yield held is not None
 
 
 def is_locked(path: Path) -> bool:
-    """Return True if a process holds ``path`` alone, or if nobody can tell."""
+    """Return True if a process holds ``path`` alone, or if the file system cannot tell."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

@@ -1,4 +1,4 @@
-"""What a run would do: for each stage whether its results are there, and if not, what changed."""
+"""Plan a run: for each stage, find its results in the store, or say what changed and estimate the cost."""
 
 from __future__ import annotations
 
@@ -23,30 +23,31 @@ from cleargs.progress import Reporter
 from cleargs.safe_io import require_utf8
 
 MIN_ADDRESS_SPACE_GB = 2.0
-"""What the libraries reserve before any work is done."""
+"""Address space that the libraries reserve when they are imported."""
 
 WORTH_MEASURING_MIN = 2.0
-"""Minutes of expected work from which it is worth seconds to measure how fast this machine is."""
+"""Expected work, in minutes, from which measuring the speed of this machine is worth its seconds."""
 
-NOT_MADE = "not made yet"
-"""Why the results of a stage are not there that the run never had."""
+NO_RESULTS = "no results yet"
+"""Reason of a stage that never had results in this run."""
 
 Origins = dict[str, dict[str, str]]
+"""Input ("STAGE/PATH") or role of an external -> relative path of a file -> its digest."""
 
 State = Literal["done", "partial", "missing"]
-"""`partial`: there, but its own work is not whole."""
+"""``partial``: the results exist, but the stage could not make all of them."""
 
 
 @dataclass(frozen=True)
 class StageKey:
-    """What one stage would be made from, all of it known."""
+    """The key of a stage, and the files behind it."""
 
     parts: KeyParts
     origins: Origins
     inputs: Mapping[str, Path]
     """Upstream stage -> its finished folder."""
     inherited: tuple[str, ...]
-    """What the stages before could not make."""
+    """Outputs that are missing upstream, one line each."""
 
     @property
     def key(self) -> str:
@@ -61,23 +62,23 @@ class StagePlan:
     stage: str
     state: State
     reasons: tuple[str, ...]
-    """Why it is no hit, or what a partial one lacks."""
+    """Reasons why it is missing, or outputs that a partial stage lacks."""
     estimate: Estimate | None = None
-    """Cost of the work to do; None where there is none."""
+    """Cost of the work to do; None if it is done."""
     stage_key: StageKey | None = None
-    """None while a stage before it must run first. As keys are made of content, it may be done after all."""
+    """None until the upstream stages are done: the key depends on the content of their outputs."""
     manifest: Manifest | None = None
-    """That of a stage that is done."""
+    """Manifest of a stage that is done."""
 
     @property
     def key(self) -> str | None:
-        """The key of the stage's results; None while a stage before it must run first."""
+        """The key of the stage; None until the upstream stages are done."""
         return self.stage_key.key if self.stage_key is not None else None
 
 
 @dataclass
 class Planner:
-    """Makes recipes and compares them with what the store and the run folder hold. Writes nothing."""
+    """Computes keys and compares them with the store and the run folder. Writes nothing."""
 
     dag: Dag
     run: RunSpec
@@ -87,10 +88,15 @@ class Planner:
     _estimates: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False)
 
     def stage_key(self, name: str, done: Mapping[str, Manifest], *, rehash: bool = False) -> StageKey:
-        """What ``name`` is made from, given the manifests of the stages before it.
+        """Return the key of the stage ``name``.
 
-        With ``rehash`` every external is read, whatever the memo says of it. Raises InputError when one (the
-        capture, a model) cannot be read.
+        Args:
+            name: The stage.
+            done: The manifests of the upstream stages.
+            rehash: Read every external file again instead of using digests from the memo.
+
+        Raises:
+            InputError: An external (the capture, a model) cannot be read.
         """
         stage, config = self.dag.load(name), self.run.config.sections[name]
         inputs, origins = self.inputs(name, done)
@@ -103,11 +109,11 @@ class Planner:
             inputs=inputs,
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
-            device=self.run.device,
-            libraries=library_versions(stage, self.run.device) | plugin_versions(config),
+            device=self.run.device_of(name),
+            libraries=library_versions(stage, self.run.device_of(name)) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
-        inherited: dict[str, None] = {}  # in order, each once
+        inherited: dict[str, None] = {}  # an ordered set
         for upstream in stage.INPUTS:
             inherited |= dict.fromkeys(done[upstream].inherited)
             inherited |= dict.fromkeys(f"{upstream}: {missing}" for missing in done[upstream].missing)
@@ -116,7 +122,7 @@ class Planner:
     def inputs(
         self, name: str, done: Mapping[str, Manifest]
     ) -> tuple[dict[str, dict[str, str | None]], Origins]:
-        """Digests of what ``name`` reads of the stages before it, and those of the single files."""
+        """Return upstream stage -> path -> digest of the inputs of ``name``, and digests of single files."""
         origins: Origins = {}
         inputs: dict[str, dict[str, str | None]] = {}
         for upstream, paths in self.dag.load(name).INPUTS.items():
@@ -131,42 +137,44 @@ class Planner:
         return self.dag.load(name).externals(self.run.config.sections[name], self.run.source)
 
     def external_digests(self, name: str, *, rehash: bool = False) -> dict[str, dict[str, str]]:
-        """Role -> relative path -> digest of what ``name`` reads outside the store.
+        """Return role -> relative path -> digest of the files that ``name`` reads outside the store.
 
-        With ``rehash`` every file is read. Raises InputError when one cannot be read or holds the run.
+        With ``rehash``, every file is read again. Raises InputError if one cannot be read, or if the run is
+        inside the input.
         """
         places = self._externals(name)
-        hint = "choose a folder beside the input with -o"
+        hint = "choose a folder next to the input with -o"
         for folder in (self.run.folder, self.run.source, self.store.root):
             require_utf8(folder)
         if self.run.folder == self.run.source:
             raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
         for place in places.values():
             if isinstance(place, Path) and self.run.folder.is_relative_to(place):
-                raise InputError(f"the run folder {self.run.folder} lies inside the input {place}", hint=hint)
+                raise InputError(f"the run folder {self.run.folder} is inside the input {place}", hint=hint)
         return {role: self.store.memo.digests_of(place, rehash=rehash) for role, place in places.items()}
 
     def reasons(self, stage_key: StageKey, entry: Entry | None) -> tuple[str, ...]:
-        """Why the results of ``stage_key`` are not there, in lines for a reader."""
+        """Return the reasons why there are no complete results for ``stage_key``, for users."""
         if entry is not None and entry.damage is not None:
             return (f"damaged: {entry.damage}",)
         if entry is not None and entry.usable is not None:
-            return tuple(f"retried, was missing: {missing}" for missing in entry.usable.missing)
+            return tuple(f"retry, missing so far: {missing}" for missing in entry.usable.missing)
         before = last_shown(self.run.folder, stage_key.parts.stage)
         if before is None:
-            return (NOT_MADE,)
+            return (NO_RESULTS,)
         changes = differences(before.parts, stage_key.parts, before.origins, stage_key.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
     @cached_property
     def pace(self) -> float:
-        """By which estimates are multiplied: this machine's time over that of the one they were made on."""
+        """Factor of the estimates: time on this machine divided by that on the machine of the estimates."""
         return self.dag.pace(None)
 
     def at_measured_pace(self, plans: list[StagePlan]) -> list[StagePlan]:
-        """``plans`` with the costs on this machine, whose pace is measured now unless it is known.
+        """Return ``plans`` with the costs on this machine. Measures its pace unless it is known.
 
-        Short work is over before a better estimate of it is worth anything; of a GPU's nothing is measured.
+        Short plans are returned as they are, because measuring takes seconds. So are those for a GPU, whose
+        pace is not measured.
         """
         costs = [plan.estimate.minutes for plan in plans if plan.estimate is not None]
         if self.run.device != "cpu" or sum(costs) < WORTH_MEASURING_MIN:
@@ -179,7 +187,7 @@ class Planner:
         ]
 
     def estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
-        """Rough cost of ``name`` on this machine, from its settings and the finished stages before it."""
+        """Estimate the cost of ``name`` on this machine from its settings and finished upstream stages."""
         return self._estimate(name, done).at_pace(self.pace)
 
     def _estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
@@ -198,7 +206,7 @@ class Planner:
         return self._estimates[known]
 
     def context(self, name: str, inputs: Mapping[str, Path], work: WorkFolder) -> StageContext[Any]:
-        """All that the stage ``name`` is told."""
+        """Return the context that the stage ``name`` receives."""
         return StageContext(
             config=self.run.config.sections[name],
             settings={other: self.run.config.sections[other] for other in self.dag.load(name).SETTINGS},
@@ -209,13 +217,13 @@ class Planner:
             checkpoints=work.checkpoints,
             cache=self.store.cache_folder(name),
             seed=self.run.config.seed,
-            device=self.run.device,
+            device=self.run.device_of(name),
             threads=self.threads,
             reporter=self.reporter,
         )
 
     def outdated(self) -> list[str]:
-        """Stages whose results the run shows although its settings or inputs are others now, in order.
+        """Return the stages that the run must not show any more: their settings or inputs have changed.
 
         Results of an older version of the program or of a library are not outdated.
         """
@@ -230,24 +238,26 @@ class Planner:
         return [name for name in self.dag.names if name not in shown]
 
     def _with_present_settings(self, manifest: Manifest, shown: Mapping[str, Manifest]) -> KeyParts:
-        """The parts of ``manifest`` with the settings and inputs that its stage has now."""
+        """Return the parts of ``manifest`` with the current settings and inputs of its stage."""
         name, parts = manifest.stage, manifest.parts
         digests = self.external_digests(name)
         return parts.model_copy(
             update={
-                "config": _known(
+                "config": _updated(
                     stage_key_config(self.dag.load(name), name, self.run.config.sections), parts.config
                 ),
                 "seed": self.run.config.seed,
-                "inputs": _known(self.inputs(name, shown)[0], parts.inputs),
-                "externals": _known({role: tree_digest(digests[role]) for role in digests}, parts.externals),
+                "inputs": _updated(self.inputs(name, shown)[0], parts.inputs),
+                "externals": _updated(
+                    {role: tree_digest(digests[role]) for role in digests}, parts.externals
+                ),
             }
         )
 
     def plan(self, until: str | None = None, force: tuple[str, ...] = ()) -> list[StagePlan]:
-        """The state of each stage up to ``until``.
+        """Return the state of each stage up to and including ``until``; stages in ``force`` count as missing.
 
-        Raises InputError when an external of any of them cannot be read: better now than after hours of work.
+        Raises InputError if an external of any stage cannot be read: better now than after hours of work.
         """
         plans: list[StagePlan] = []
         done: dict[str, Manifest] = {}
@@ -272,62 +282,64 @@ class Planner:
         return plans
 
 
-def _known(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
-    """``before`` with the values of ``now``. A name that only one of them has came or went with a version of
-    the program.
+def _updated(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``before`` with the values of ``now``, for the names that ``before`` has.
+
+    A name that only one of them has belongs to another version of the program, which is not a change.
     """
     return {
-        name: _known(now[name], value)
+        name: _updated(now[name], value)
         if isinstance(value, Mapping) and isinstance(now.get(name), Mapping)
         else now.get(name, value)
         for name, value in before.items()
     }
 
 
-def redo_lines(plans: list[StagePlan]) -> list[str]:
-    """What of an existing run would be made again, and why; none where nothing is there yet."""
+def rerun_lines(plans: list[StagePlan]) -> list[str]:
+    """Return one line per stage whose results must be replaced, with the reasons. Empty for a new run."""
     lines = [
-        f"{plan.stage} is made again: {'; '.join(plan.reasons)}"
+        f"{plan.stage} runs again: {'; '.join(plan.reasons)}"
         for plan in plans
-        if plan.stage_key is not None and plan.state != "done" and plan.reasons != (NOT_MADE,)
+        if plan.stage_key is not None and plan.state != "done" and plan.reasons != (NO_RESULTS,)
     ]
     after = [plan.stage for plan in plans if plan.stage_key is None]
-    return [*lines, f"then {', '.join(after)}"] if lines and after else lines
+    return [*lines, f"then: {', '.join(after)}"] if lines and after else lines
 
 
 def cost_line(plans: list[StagePlan]) -> str:
-    """One line of expected minutes, memory and disk for each stage with work to do; "" without work."""
+    """Return one line with the expected time, memory and disk of each stage that has work to do."""
     costs = [(plan.stage, plan.estimate) for plan in plans if plan.estimate is not None]
     if not costs:
         return ""
     words = [
-        f"{stage} {_time(cost.minutes)} {cost.memory_gb:.1f} GB, disk {_size(cost.disk_gb)}"
+        f"{stage} {_time(cost.minutes)}, {cost.memory_gb:.1f} GB memory, {_size(cost.disk_gb)} disk"
         for stage, cost in costs
     ]
-    return f"expected about {_time(sum(cost.minutes for _, cost in costs))}: " + "; ".join(words)
+    return f"estimate: about {_time(sum(cost.minutes for _, cost in costs))} ({'; '.join(words)})"
 
 
 def check_disk(plans: list[StagePlan], store: Path) -> None:
-    """Raise StoreError when the disk of ``store`` has less free space than the stages to run will fill."""
+    """Raise StoreError if the disk of ``store`` has less free space than the stages to run need."""
     needed = sum(plan.estimate.disk_gb for plan in plans if plan.estimate is not None)
     place = next(folder for folder in (store, *store.parents) if folder.exists())
     disk = shutil.disk_usage(place)
     free = disk.free / 1e9
-    if disk.total and needed > free:  # a place without a disk (/proc) is told of when it is written to
+    if disk.total and needed > free:  # /proc and the like have no size; writing there fails later
         raise StoreError(
-            f"the run needs about {_size(needed)} of disk, {_size(free)} are free at {place}",
+            f"the run needs about {_size(needed)} of disk, and {place} has {_size(free)} free",
             hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",
         )
 
 
 def check_address_space() -> None:
-    """Raise InputError where a limit on addresses (``ulimit -v``) does not even let the libraries in: some of
-    them wait for ever then.
+    """Raise InputError if the limit on address space (``ulimit -v``) is too low to import the libraries.
+
+    Some of them would hang.
     """
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_GB * 1e9:
         raise InputError(
-            f"this shell allows a process {_size(limit / 1e9)} of addresses; the libraries alone need "
+            f"the limit on virtual memory is {_size(limit / 1e9)}; ClearGS needs at least "
             f"{MIN_ADDRESS_SPACE_GB:.0f} GB",
             hint="raise the limit: ulimit -v unlimited",
         )

@@ -1,4 +1,4 @@
-"""``RUN/run.toml``: the input, the full resolved configuration, and where the results are stored."""
+"""``RUN/run.toml``: the input, the full configuration, and the place of the store."""
 
 from __future__ import annotations
 
@@ -18,46 +18,59 @@ from cleargs.pipeline.store import STORE_FOLDER
 RUN_FILE = "run.toml"
 
 LOCK = ".lock"
-"""Held by the process that works in the run folder."""
+"""Lock file of the process that works in the run folder."""
 
 HEADER = """\
-# The full configuration of this run, as `cleargs run` resolved it: all commands on the run read it, and the
-# settings stay until `cleargs run` is told others (--set, --workflow, or --reset to start from the recipe).
+# The full configuration of this run. All commands on the run read it. `cleargs run` keeps these settings
+# until you change them: --set and --workflow give others, --reset starts from the recipe.
 """
 
 WIDTH = 110
-"""Of the comments, characters."""
+"""Maximum width of a comment, in characters."""
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """A run folder and all that decides its results."""
+    """A run folder and everything that decides its results."""
 
     folder: Path
-    """Absolute."""
+    """Absolute path of the run folder."""
     source: Path
-    """The capture as the user gave it, absolute."""
+    """Absolute path of the capture."""
     config: Config
     store: Path
-    """Absolute."""
+    """Absolute path of the store."""
     device: Device
+    on_cpu: tuple[str, ...] = ()
+    """Stages that run on the CPU although `device` is the GPU, because its kernels failed there."""
+    falls_back: bool = field(default=False, compare=False)
+    """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
+
+    def device_of(self, stage: str) -> Device:
+        """Return the device of one stage."""
+        return "cpu" if stage in self.on_cpu else self.device
 
 
 def write_run_file(run: RunSpec) -> None:
-    """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
+    """Create the run folder and write its ``run.toml``. Raises StoreError if that is impossible."""
     document: Document = {"input": str(run.source), "device": run.device}
+    if run.on_cpu:
+        document["on_cpu"] = list(run.on_cpu)
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
     document["seed"] = run.config.seed
-    path, text = run.folder / RUN_FILE, (HEADER + tomli_w.dumps(document) + _commented(run.config)).encode()
+    path, text = (
+        run.folder / RUN_FILE,
+        (HEADER + tomli_w.dumps(document) + _settings_toml(run.config)).encode(),
+    )
     with disk_errors(path):
         run.folder.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.read_bytes() != text:
             write_bytes(path, text)
 
 
-def _commented(config: Config) -> str:
-    """All settings as TOML, each below its meaning, range and default; unset ones as a comment."""
+def _settings_toml(config: Config) -> str:
+    """Return all settings as TOML, each below its meaning, range and default. Unset ones are comments."""
     tables: dict[str, list[str]] = {}
     for setting, value in config.settings():
         table, _, field = setting.name.rpartition(".")
@@ -67,7 +80,7 @@ def _commented(config: Config) -> str:
         lines += wrap(comment, WIDTH, initial_indent="# ", subsequent_indent="# ")
         if value is None:
             lines.append(f"# {field} =")
-        elif isinstance(value, list):  # tomli_w spreads lists over lines
+        elif isinstance(value, list):  # tomli_w writes one line per item
             items = (tomli_w.dumps({"_": item}).partition("=")[2].strip() for item in value)
             lines.append(f"{field} = [{', '.join(items)}]")
         else:
@@ -77,22 +90,23 @@ def _commented(config: Config) -> str:
 
 @dataclass(frozen=True)
 class RunMetadata:
-    """Content of the ``run.toml`` of an earlier call; None for what it does not say or says wrongly."""
+    """Content of an existing ``run.toml``; None for an entry that is missing or invalid."""
 
     settings: Document = field(default_factory=dict)
-    """Unchecked."""
+    """The settings, unchecked."""
     source: Path | None = None
     store: Path | None = None
     device: Device | None = None
+    on_cpu: tuple[str, ...] = ()
     damaged: bool = False
-    """True when it says one of the three wrongly."""
+    """True if input, store, device or on_cpu is invalid."""
 
 
 def read_metadata(folder: Path) -> RunMetadata:
-    """Return what `write_run_file` noted in ``folder``; nothing when there is no run.
+    """Return the content of ``run.toml`` in ``folder``, or empty metadata if there is none.
 
-    Each of input, store and device is read on its own: a damaged one hides no other. Raises ConfigError when
-    the file is no TOML.
+    An invalid input, store, device or on_cpu does not hide the others. Raises ConfigError if the file is not
+    valid TOML.
     """
     if not (folder / RUN_FILE).is_file():
         return RunMetadata()
@@ -106,11 +120,15 @@ def read_metadata(folder: Path) -> RunMetadata:
     device = given["device"] if given["device"] in ("cpu", "cuda") else None
     read = {*paths, *(["device"] if device else [])}
     damaged = any(value not in (None, "") and name not in read for name, value in given.items())
-    return RunMetadata(document, paths.get("input"), paths.get("store"), device, damaged)
+    on_cpu = document.pop("on_cpu", [])
+    if not isinstance(on_cpu, list) or not all(isinstance(name, str) for name in on_cpu):
+        on_cpu, damaged = [], True
+    source, store = paths.get("input"), paths.get("store")
+    return RunMetadata(document, source, store, device, tuple(on_cpu), damaged)
 
 
 def read_source(folder: Path) -> Path | None:
-    """Return the capture that the run in ``folder`` was made from; None where none can be read."""
+    """Return the capture of the run in ``folder``; None if ``run.toml`` does not say."""
     try:
         return read_metadata(folder).source
     except ConfigError:
@@ -120,23 +138,32 @@ def read_source(folder: Path) -> Path | None:
 def read_run_file(
     folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None
 ) -> RunSpec:
-    """The run that `write_run_file` noted in ``folder``; ``store`` and ``device`` override what it says.
+    """Read the run in ``folder``.
 
-    Raises InputError when there is no run, ConfigError when its file is damaged.
+    Args:
+        folder: The run folder.
+        dag: The stages, whose models check the settings.
+        store: Store to use instead of that in ``run.toml``.
+        device: Device to use instead of that in ``run.toml``.
+
+    Raises:
+        InputError: The folder has no ``run.toml``.
+        ConfigError: The file is damaged.
     """
     folder = folder.absolute()
     if not (folder / RUN_FILE).is_file():
         raise InputError(
-            f"{folder} is no run: it has no {RUN_FILE}", hint=f"start one: cleargs run INPUT -o {folder}"
+            f"{folder} is not a run: it has no {RUN_FILE}", hint=f"start one: cleargs run INPUT -o {folder}"
         )
     metadata = read_metadata(folder)
     if metadata.source is None or metadata.damaged:
         raise damaged_run_file(folder)
     config = check_document(dag, metadata.settings)
     place = store or metadata.store or folder / STORE_FOLDER
-    return RunSpec(folder, metadata.source, config, place, device or metadata.device or "cpu")
+    on_cpu, chosen = (metadata.on_cpu, metadata.device) if device is None else ((), device)
+    return RunSpec(folder, metadata.source, config, place, chosen or "cpu", on_cpu, device is None)
 
 
 def damaged_run_file(folder: Path) -> ConfigError:
-    """Return the error for a ``run.toml`` whose input, store or device cannot be used."""
-    return ConfigError(f"{folder / RUN_FILE} is damaged", hint="call `cleargs run` with its input again")
+    """Return the error for a ``run.toml`` with an invalid input, store or device."""
+    return ConfigError(f"{folder / RUN_FILE} is damaged", hint="call `cleargs run` again with its input")

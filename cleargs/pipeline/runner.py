@@ -1,4 +1,4 @@
-"""The runner: brings each stage of a run from its recipe to a finished folder in the store."""
+"""The runner: find the results of each stage in the store, or run the stage and publish them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from cleargs.digest import file_digest, tree_digest
-from cleargs.errors import InputError, StageError, StoreError
+from cleargs.errors import CleargsError, InputError, StageError, StoreError
 from cleargs.manifest import (
     FileRecord,
     Manifest,
@@ -27,7 +27,7 @@ from cleargs.manifest import (
 )
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import recorded_progress
-from cleargs.pipeline.lock import only_one
+from cleargs.pipeline.lock import exclusive_lock
 from cleargs.pipeline.plan import (
     Planner,
     StageKey,
@@ -35,7 +35,7 @@ from cleargs.pipeline.plan import (
     check_address_space,
     check_disk,
     cost_line,
-    redo_lines,
+    rerun_lines,
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, read_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
@@ -44,7 +44,7 @@ from cleargs.progress import Reporter
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """What became of one stage."""
+    """Outcome of one stage of a run."""
 
     stage: str
     how: Literal["found", "made"]
@@ -53,7 +53,7 @@ class StageOutcome:
 
 
 class Runner:
-    """Runs stages of one run folder. ``store.in_use()`` is held by each public method while it works."""
+    """Runs the stages of one run. Public methods hold ``store.in_use()`` while they work."""
 
     def __init__(self, dag: Dag, run: RunSpec, store: Store, threads: int, reporter: Reporter) -> None:
         self.dag = dag
@@ -65,11 +65,20 @@ class Runner:
     def run_until(
         self, until: str | None = None, *, force: Sequence[str] = (), allow_partial: bool = False
     ) -> list[StageOutcome]:
-        """Bring every stage up to ``until`` to a finished folder; link each into the run.
+        """Find or make the results of each stage, and link them into the run folder.
 
-        Stops after a stage that is done only in part unless ``allow_partial``: the last outcome then says
-        what is missing. Raises InputError before any work where a model that one of them needs is not
-        there, CleargsError where a stage fails; what was finished before it stays.
+        Args:
+            until: The last stage; None for all stages.
+            force: Stages to run even if their results are in the store.
+            allow_partial: Continue after a stage that is done only in part. Otherwise, the run stops there
+                and the last outcome lists what is missing.
+
+        Returns:
+            The outcome of each stage that was found or made, in order.
+
+        Raises:
+            InputError: A model that a stage needs is missing. Nothing was started.
+            CleargsError: A stage failed. The stages before it are finished.
         """
         check_address_space()
         forced = tuple(self.dag.check(name) for name in force)
@@ -79,14 +88,14 @@ class Runner:
                 self.dag.load(plan.stage).preflight(self.run.config.sections[plan.stage])
         check_disk(plans, self.store.root)
         plans = self.planner.at_measured_pace(plans)
-        for line in (*redo_lines(plans), cost_line(plans)):
+        for line in (*rerun_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)
         outcomes: list[StageOutcome] = []
         done: dict[str, Manifest] = {}
         with self._lock_run(), self.store.in_use():
             check_same_input(self.run, self.dag, self.store)
-            self._unlink_outdated()  # first: a kill in between leaves nothing of other settings in sight
+            self._unlink_outdated()  # before run.toml changes: no results of other settings
             write_run_file(self.run)
             self.store.add_root(self.run.folder)
             for name in (plan.stage for plan in plans):
@@ -102,28 +111,28 @@ class Runner:
         return outcomes
 
     def _lock_run(self) -> AbstractContextManager[bool]:
-        """Keep the run folder for this process; wait while another one works there."""
-        return only_one(self.run.folder / LOCK, self.reporter, self.run.folder.name)
+        """Hold the lock of the run folder; wait for another process that works in it."""
+        return exclusive_lock(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
     def _unlink_outdated(self) -> None:
-        """Let the run folder show no results of other settings or inputs."""
+        """Remove the links to results of other settings or inputs."""
         for name in self.planner.outdated():
             self.store.unlink(self.run.folder, name)
 
     def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
-        """Say what the stages to come cost, now that the capture is known."""
+        """Report the cost of the remaining stages again: it is better known once the capture is read."""
         costs = [
             replace(plan, estimate=self.planner.estimate(plan.stage, done))
             for plan in plans
             if plan.estimate is not None
         ]
         if line := cost_line(costs):
-            self.reporter.info(f"now {line}")
+            self.reporter.info(f"new {line}")
 
     def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> StageOutcome:
-        """Bring one stage to a finished folder, from finished stages before it.
+        """Find or make the results of one stage, from the results of its upstream stages.
 
-        Raises StageError when a stage before it is not done (or only in part, without ``allow_partial``).
+        Raises StageError if an upstream stage is not done, or done only in part without ``allow_partial``.
         """
         check_address_space()
         done: dict[str, Manifest] = {}
@@ -143,7 +152,7 @@ class Runner:
         if entry is None or entry.manifest is None:
             raise StageError(
                 f"{name} needs {upstream}, which is not done",
-                hint=f"first: cleargs stage {upstream} {self.run.folder}",
+                hint=f"run first: cleargs stage {upstream} {self.run.folder}",
             )
         if entry.manifest.status == "partial" and not allow_partial:
             raise StageError(
@@ -153,39 +162,70 @@ class Runner:
         return entry.manifest
 
     def _find(self, name: str, stage_key: StageKey) -> Entry | None:
-        """What the store holds for ``stage_key``; something damaged counts as nothing, with a warning."""
+        """Return the results for ``stage_key``. Damaged ones cause a warning and count as missing."""
         entry = self.store.find(name, stage_key.key)
         if entry is not None and entry.damage is not None:
             self.reporter.warn(
-                f"{name}: the stored results are damaged ({entry.damage}); they are made again"
+                f"{name}: the stored results are damaged ({entry.damage}); the stage runs again"
             )
             return None
         return entry
 
     def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
-        """Find or make the results of ``name``, and let the run folder show them."""
+        """Find or make the results of ``name``, and link them into the run folder.
+
+        If the kernels of the GPU fail and the run may fall back, the stage starts again on the CPU.
+        """
+        try:
+            return self._find_or_make_on_device(name, done, forced=forced)
+        except Exception as error:
+            fault = self.dag.gpu_fault(error) if self.run.device_of(name) == "cuda" else None
+            if fault is None or (isinstance(error, CleargsError) and not self.run.falls_back):
+                raise
+            if not self.run.falls_back:
+                raise StageError(
+                    f"{name}: the GPU failed ({fault})",
+                    hint="test the GPU with cleargs doctor --gpu, or run on the CPU with --device cpu",
+                ) from error
+        # Outside the except block, so that the traceback holds no memory of the GPU.
+        self._leave_gpu(name, fault)
+        return self._find_or_make_on_device(name, done, forced=forced)
+
+    def _leave_gpu(self, name: str, fault: str) -> None:
+        """Let ``name`` and the stages after it run on the CPU, now and in later calls."""
+        stages = self.dag.names[self.dag.names.index(name) :]
+        self.reporter.warn(
+            f"{name}: the GPU failed ({fault}); {', '.join(stages)} run on the CPU, {name} from its start. "
+            "Finished stages are kept. Try the GPU again with --device cuda"
+        )
+        self.run = self.planner.run = replace(self.run, on_cpu=stages)
+        write_run_file(self.run)
+
+    def _find_or_make_on_device(
+        self, name: str, done: Mapping[str, Manifest], *, forced: bool
+    ) -> StageOutcome:
         stage_key = self.planner.stage_key(name, done)
         entry = self.store.find(name, stage_key.key)
-        manifest = entry.whole if entry is not None and not forced else None
+        manifest = entry.complete if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
             stage_key = self._rehashed_key(name, done)
             entry = self.store.find(name, stage_key.key)
             reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
-            with self.store.lock(stage_key.key, self.reporter, name) as alone:
+            with self.store.lock(stage_key.key, self.reporter, name) as locked:
                 entry = self._find(name, stage_key)
-                manifest = entry.whole if entry is not None and not forced else None
-                if manifest is None:  # else another process made it while we waited
-                    self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
-                    manifest, how = self._make(stage_key, entry, forced=forced, alone=alone), "made"
+                manifest = entry.complete if entry is not None and not forced else None
+                if manifest is None:  # otherwise another process made it in the meantime
+                    self.reporter.info(f"{name}: started ({'; '.join(reasons)})")
+                    manifest, how = self._make(stage_key, entry, forced=forced, locked=locked), "made"
         manifest = self._with_inherited(manifest, stage_key.inherited)
         self.store.link(self.run.folder, name, stage_key.key)
         return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.key))
 
     def _rehashed_key(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
-        """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
+        """Return the key of ``name`` after reading all inputs again: a failing disk keeps time stamps.
 
-        Raises StoreError when an upstream result is damaged.
+        Raises StoreError if an upstream result is damaged.
         """
         for upstream, paths in self.dag.load(name).INPUTS.items():
             manifest = done[upstream]
@@ -195,16 +235,16 @@ class Runner:
             if damaged is not None:
                 raise StoreError(
                     f"{upstream}: the stored results are damaged ({damaged})",
-                    hint="the same command makes them again",
+                    hint="give the same command again; it replaces them",
                 )
         return self.planner.stage_key(name, done, rehash=True)
 
-    def _make(self, stage_key: StageKey, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
-        """Let the stage do its work and publish it. The key's lock is held."""
+    def _make(self, stage_key: StageKey, entry: Entry | None, *, forced: bool, locked: bool) -> Manifest:
+        """Run the stage and publish its results. The caller holds the lock of the key."""
         name = stage_key.parts.stage
         stage = self.dag.load(name)
         work = self.store.open_work(
-            stage_key.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
+            stage_key.key, forced=forced, entry=entry, leftovers=stage.LEFTOVERS, locked=locked
         )
         context = self.planner.context(name, stage_key.inputs, work)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
@@ -212,7 +252,7 @@ class Runner:
         try:
             with recorded_progress(self.reporter, self.run.folder, name, work.folder) as reporter:
                 result = stage.run(replace(context, reporter=reporter))
-        except BaseException:  # an interruption too: what it had done counts when it resumes
+        except BaseException:  # also when interrupted: the time counts when the stage resumes
             work.note_seconds(earlier + time.monotonic() - clock)
             raise
         seconds = earlier + time.monotonic() - clock
@@ -225,14 +265,14 @@ class Runner:
         if now != {role: stage_key.origins[role] for role in now}:
             self.store.discard(work.folder)
             raise StageError(
-                f"the input changed while {name} was reading it", hint="the same command starts it again"
+                f"the input changed while {name} was reading it", hint="give the same command again"
             )
         if not result.missing:
             absent = [output for output in stage.OUTPUTS if not (work.out / output).exists()]
             if absent:
                 raise StageError(
                     f"{name} ended without its outputs {', '.join(absent)}",
-                    hint=f"this is a fault of the stage; please report it with {self.run.folder / RUN_FILE}",
+                    hint=f"this is a bug in the stage; please report it with {self.run.folder / RUN_FILE}",
                 )
         files = {
             name: FileRecord(size=file.stat().st_size, digest=file_digest(file))
@@ -250,24 +290,24 @@ class Runner:
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
             started=started.isoformat(timespec="seconds"),
-            device=self.run.device,
+            device=self.run.device_of(name),
             summary=plain_json(result.summary),
             **cost,
         )
         published = self.store.publish(work, manifest)
         if forced and entry is not None and entry.manifest is not None:
             if entry.manifest.digest == manifest.digest:
-                self.reporter.info(f"{name}: made again, with the same digests")
+                self.reporter.info(f"{name}: the new results have the same digests as before")
             else:
-                self.reporter.warn(f"{name}: made again, with other digests than before")
-        # An equal result that was there already keeps its own times; this outcome tells those of today.
+                self.reporter.warn(f"{name}: the new results have other digests than before")
+        # An equal result that was already there keeps its manifest; the outcome has the cost of this attempt.
         return published.model_copy(update=cost)
 
     def _with_inherited(self, manifest: Manifest, inherited: tuple[str, ...]) -> Manifest:
-        """``manifest`` saying what is missing upstream *now*.
+        """Return ``manifest`` with the present list of outputs that are missing upstream.
 
-        Equal content may come from a whole upstream later. Only the manifest is written anew (atomically);
-        the outputs stay as they are.
+        The list may change while the content of the inputs, and so the key, stays the same. The manifest is
+        then replaced (atomically), and the outputs stay as they are.
         """
         if manifest.inherited == inherited:
             return manifest
@@ -278,9 +318,9 @@ class Runner:
 
 
 def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
-    """Raise InputError when ``run.folder`` was made for another capture than ``run.source``.
+    """Raise InputError if ``run.folder`` is a run of another capture than ``run.source``.
 
-    A capture that moved is the same when its content is.
+    A capture at another path is the same if its content is equal.
     """
     before = read_source(run.folder)
     if before is None or before == run.source:
@@ -299,25 +339,25 @@ def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
 
 
 class Usage:
-    """What a stage used of the machine, counted from where this is made.
+    """Processor time and memory that this process uses from now on.
 
-    The kernel's mark of the peak is set back where it can be (Linux). Elsewhere the peak is that of the
-    process so far, which may be an earlier stage's.
+    On Linux, the kernel's peak of the resident memory is reset. Elsewhere, the peak is that of the whole
+    process, and may come from an earlier stage.
     """
 
     def __init__(self) -> None:
         with suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")  # sets the mark back
+            Path("/proc/self/clear_refs").write_text("5")  # resets the peak (man 5 proc)
         self._cpu_seconds, self._peak_of_children = _cpu_seconds(), _peak(resource.RUSAGE_CHILDREN)
 
     @property
     def cpu_seconds(self) -> float:
-        """Processor time of all threads, and of children that have ended, seconds."""
+        """Processor time of all threads and of ended child processes, in seconds."""
         return _cpu_seconds() - self._cpu_seconds
 
     @property
     def peak_memory_gb(self) -> float:
-        """Largest resident memory, GB (1e9 bytes); a child counts where it was larger than any before."""
+        """Peak of the resident memory, GB (1e9 bytes); that of a child if it is the largest so far."""
         own, children = _peak(resource.RUSAGE_SELF), _peak(resource.RUSAGE_CHILDREN)
         with suppress(OSError):
             if found := re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text()):
@@ -331,5 +371,5 @@ def _cpu_seconds() -> float:
 
 
 def _peak(who: int) -> int:
-    """Bytes; macOS counts in bytes, Linux in units of 1024."""
+    """Return the peak in bytes. macOS counts in bytes, Linux in KiB."""
     return resource.getrusage(who).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

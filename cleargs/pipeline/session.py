@@ -1,17 +1,16 @@
-"""How work begins, for the command line and the library alike: device, store, and a run as asked for."""
+"""Choose device, store and settings of a run, for the command line and the library."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
+from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
 from cleargs.pipeline.config import check_document, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
@@ -27,47 +26,60 @@ from cleargs.pipeline.store import STORE_FOLDER, Store
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
-MOST_NAMED = 3  # settings of an existing run that are named
-UNUSED_GPU = "there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does"
+MAX_LISTED = 3  # settings of an existing run that a message lists
 
 
 def usable_cores() -> int:
-    """The CPU cores that this process may use, as far as the system says."""
+    """Return the number of CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def resolve_device(choice: DeviceChoice, say: Callable[[str], None]) -> Device:
-    """The device class to use. Looks for a GPU without importing torch, which would cost seconds.
+def resolve_device(
+    choice: DeviceChoice, say: Callable[[str], None], *, kept: Device | None = None, test: bool = False
+) -> Device:
+    """Return the device to use. Does not import torch, which would take seconds.
 
-    Where ``auto`` leaves a GPU alone, ``say`` is told. Raises InputError when ``cuda`` is asked for and
-    cannot be had.
+    Args:
+        choice: The user's choice. ``auto`` uses a GPU that passed its self-test and is faster than the CPU.
+        say: Receives a message with the choice of ``auto`` and its reason.
+        kept: The device of an existing run, which ``auto`` keeps.
+        test: Let ``auto`` run the self-test of a GPU that was not tested yet.
+
+    Raises:
+        InputError: The chosen or kept device is a GPU that cannot be used.
     """
-    obstacle = None if choice == "cpu" else cuda_obstacle()
-    if choice != "cuda":  # auto stays on the CPU until tests/gpu/run.sh has passed on a GPU (docs/gpu.md)
-        if choice == "auto" and obstacle is None:
-            say(UNUSED_GPU)
+    if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
-    if obstacle is not None:
+    obstacle = cuda_obstacle()
+    if obstacle is not None and (choice == "cuda" or kept == "cuda"):
         raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")
-    return "cuda"
-
-
-def cuda_obstacle() -> str | None:
-    """Why work cannot run on an NVIDIA GPU here; None when it can."""
-    if not any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg")):
-        return "there is no NVIDIA GPU"
-    if find_spec("triton") is None:
-        return "Triton is not installed (pip install 'cleargs[cuda]')"
-    if version("torch").endswith("+cpu"):
-        return "this PyTorch is built for the CPU only (install a CUDA build)"
-    return None
+    if choice == "cuda":
+        return "cuda"
+    if obstacle is not None:
+        if obstacle != NO_GPU:
+            say(f"device: the CPU, because {obstacle}")
+        return "cpu"
+    facts = current_facts()
+    tested = cached_test(facts) or (self_test(facts, say) if test else None)
+    if kept == "cuda":
+        if tested is not None and tested.fault is not None:
+            raise InputError(
+                f"the run used the GPU, but {tested.reason}",
+                hint="run its stages again with --device cpu, or stay on the GPU with --device cuda",
+            )
+        return "cuda"
+    if tested is None:
+        say("device: the CPU, because the GPU is not tested yet (cleargs doctor --gpu tests it)")
+        return "cpu"
+    say(f"device: the {'GPU' if tested.device == 'cuda' else 'CPU'}, because {tested.reason}")
+    return tested.device
 
 
 @contextmanager
 def opened_store(root: Path) -> Iterator[Store]:
-    """The store at ``root`` with its digest memo. Its folder appears when the first stage starts."""
+    """Yield the store at ``root`` with its digest memo. The folder is created when the first stage starts."""
     root = root.absolute()
     with DigestMemo(root / "digests.sqlite") as memo:
         yield Store(root, memo)
@@ -84,21 +96,37 @@ def resolve_run(
     reset: bool = False,
     store: Path | None = None,
     device: DeviceChoice = "auto",
+    test_gpu: bool = True,
     say: Callable[[str], None],
 ) -> RunSpec:
-    """The run of the capture ``source`` in ``folder``, all that decides its results resolved.
+    """Return the run of a capture, with everything that decides its results.
 
-    An existing run keeps its settings, its store and its device, each unless it is given here; ``reset``
-    forgets the settings, as does a ``workflow``. ``say`` is told what is kept. Raises InputError when
-    ``source`` is missing or itself a run, ConfigError for settings that cannot be used.
+    An existing run keeps its settings, store and device unless an argument gives others.
+
+    Args:
+        dag: The stages, whose models check the settings.
+        source: The capture.
+        folder: The run folder, which need not exist.
+        workflow: Recipe to start from instead of the settings of an existing run.
+        overrides: Settings as ``a.b=value``.
+        seed: Seed instead of that of the recipe or the run.
+        reset: Start from the recipe instead of the settings of an existing run.
+        store: Folder of the store instead of that of the run.
+        device: Device instead of that of the run, unless "auto".
+        test_gpu: Let "auto" run the self-test of a GPU that was not tested yet.
+        say: Receives messages about the device, and about settings that the run keeps.
+
+    Raises:
+        InputError: ``source`` does not exist or is a run.
+        ConfigError: A setting is unknown or cannot be used.
     """
     if not source.exists():
-        raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
+        raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")
     if (source / RUN_FILE).is_file():
         made_from = read_source(source)
         raise InputError(
             f"{source} is a run, not a capture",
-            hint=f"give the capture that it was made from{f': {made_from}' if made_from else ''}",
+            hint=f"give the capture of this run{f': {made_from}' if made_from else ''}",
         )
     folder, forgets = folder.absolute(), reset or workflow is not None
     metadata, kept = RunMetadata(), None
@@ -106,22 +134,24 @@ def resolve_run(
         metadata = read_metadata(folder)
         if metadata.damaged:
             raise damaged_run_file(folder)
-        # Checked, they hold no names that are gone: those would contradict what is set now.
+        # The check drops retired settings. In the raw document they could contradict the overrides.
         kept = check_document(dag, metadata.settings) if metadata.settings and not forgets else None
     except ConfigError as error:
         if not forgets:
             raise ConfigError(
-                f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
+                f"the settings of {folder} cannot be used: {error}", hint="start from the recipe with --reset"
             ) from error
     config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
-    chosen = resolve_device(metadata.device or device if device == "auto" else device, say)
+    keeps = device == "auto" and metadata.device is not None
+    chosen = resolve_device(device, say, kept=metadata.device, test=test_gpu)
     if kept is not None:
         own = [f"seed={kept.seed}"] if kept.seed else []
         own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
-        line = ", ".join(own[:MOST_NAMED]) + (
-            f" and {len(own) - MOST_NAMED} more" if own[MOST_NAMED:] else ""
+        line = ", ".join(own[:MAX_LISTED]) + (
+            f" and {len(own) - MAX_LISTED} more" if own[MAX_LISTED:] else ""
         )
         if own:
-            say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
-    return RunSpec(folder, source.absolute(), config, root, chosen)
+            say(f"settings kept from {folder / RUN_FILE}: {line}; --reset starts from the recipe")
+    on_cpu = metadata.on_cpu if keeps else ()
+    return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")

@@ -1,4 +1,4 @@
-"""What a run may be told: every setting of the stages' models with its default, range and meaning."""
+"""The settings of all stages, with default, range and meaning."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ TYPE_NAMES: Mapping[Any, str] = {
     bool: "true or false",
     str: "text",
 }
-"""How the types of settings are called."""
+"""Type -> its name for users."""
 
 LIMITS = (("ge", "at least"), ("gt", "more than"), ("le", "at most"), ("lt", "less than"))
-"""How pydantic calls the ends of a range, and how an error does."""
+"""Pydantic's name for an end of a range -> the words of a message."""
 
 OPTIONS = ("threads", "device", "store", "until")
-"""What is no setting, but an option of the command line."""
+"""Names that users try as settings, although they are options of the command line."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,16 @@ class Setting:
     """One setting of a stage."""
 
     name: str
-    """With its stage and tables: ``rivr.distil.steps``."""
+    """Full name, with stage and tables, for example ``rivr.distil.steps``."""
     default: Any
-    """A JSON value; None: unset."""
+    """A JSON value; None if unset."""
     allowed: str
-    """Type and range in words."""
+    """Type and range, for users."""
     meaning: str
 
     @property
     def default_text(self) -> str:
-        """The default as it is written after ``--set NAME=``; "unset" for None."""
+        """The default as written after ``--set NAME=``; "unset" for None."""
         match self.default:
             case None:
                 return "unset"
@@ -54,7 +54,7 @@ class Setting:
 
 
 def settings_of(section: str, model: type[BaseModel]) -> list[Setting]:
-    """The settings of a stage in the order in which its model declares them."""
+    """Return the settings of the stage ``section``, in the order in which its model declares them."""
     defaults = model()
     plain = dict(flattened(defaults.model_dump(mode="json")))
     return [
@@ -69,7 +69,7 @@ def settings_of(section: str, model: type[BaseModel]) -> list[Setting]:
 
 
 def fields_of(model: BaseModel, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
-    """Dotted name, declaration and value of each setting in a table and in the tables below it."""
+    """Yield dotted name, declaration and value of each setting in a table and its subtables."""
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
         if isinstance(value, BaseModel):
@@ -79,7 +79,7 @@ def fields_of(model: BaseModel, prefix: str = "") -> Iterator[tuple[str, FieldIn
 
 
 def flattened(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of each setting in nested tables."""
+    """Yield dotted name and value of each setting in nested tables."""
     for name, value in tables.items():
         if isinstance(value, dict):
             yield from flattened(value, f"{prefix}{name}.")
@@ -88,7 +88,7 @@ def flattened(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def allowed(annotation: Any, metadata: Iterable[Any] = ()) -> str:
-    """What a field takes, in words: its choices, or its type and range."""
+    """Return the values that a field allows, for users: its choices, or its type and range."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return allowed(parts[0], [limit for field in parts[1:] for limit in field.metadata])
@@ -110,13 +110,13 @@ def allowed(annotation: Any, metadata: Iterable[Any] = ()) -> str:
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
-    """A hint at the one of the ``known`` names that was probably meant by ``name``.
+    """Return a hint with the setting that the user probably meant by the unknown ``name``.
 
-    The nearest by spelling in its table comes first, then that in its stage, then that anywhere.
+    The table of ``name`` is searched first for a similar name, then its stage, then all ``known`` names.
     """
     table, _, field = name.rpartition(".")
     if field in OPTIONS:
-        return f"that is an option: --{field}"
+        return f"use the option --{field}"
     for place in (table, name.partition(".")[0], ""):
         inside = {
             full.rpartition(".")[2]: full for full in known if not place or full.startswith(f"{place}.")
@@ -124,4 +124,4 @@ def suggestion(name: str, known: Collection[str]) -> str:
         if near := get_close_matches(field, inside, n=1, cutoff=0.7):
             return f"did you mean {inside[near[0]]}?"
     siblings = [full for full in known if full.rpartition(".")[0] == table]
-    return f"known: {', '.join(siblings)}; see cleargs settings"
+    return f"choose one of {', '.join(siblings)}, or see cleargs settings"

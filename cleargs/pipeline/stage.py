@@ -1,4 +1,4 @@
-"""What a stage is: the contract between the runner and the modules in ``stages/``."""
+"""The interface between the runner and the modules in ``stages/``."""
 
 from __future__ import annotations
 
@@ -19,92 +19,101 @@ C = TypeVar("C", bound=BaseModel, covariant=True)
 
 @dataclass(frozen=True)
 class StageContext(Generic[C]):
-    """All that a stage may know about its surroundings."""
+    """Everything that the runner passes to a stage."""
 
     config: C
-    """The stage's own section of the run's configuration."""
+    """The settings of this stage."""
     source: Path
-    """The capture as the user gave it; only ``ingest`` reads it."""
+    """Path of the capture, as given by the user. Only ``ingest`` reads it."""
     inputs: Mapping[str, Path]
     """Finished folder of each upstream stage, by name."""
     externals: Mapping[str, External]
-    """What the stage's ``externals`` returned: files whose content is part of the key."""
+    """Result of `Stage.externals`: files outside the store whose content is part of the key."""
     out: Path
-    """Outputs go here. What a killed try of the same key left is still here; files appear atomically."""
+    """Folder for the outputs. It still holds the files of a killed attempt at the same key, so files must be
+    written atomically.
+    """
     checkpoints: Path
-    """In-stage state. Never published, deleted when the stage is done."""
+    """Folder for intermediate state. It is never published, and deleted when the stage is done."""
     cache: Path
-    """What was found out about single items (frames, say), for any later work of this stage in the store:
-    files that appear whole, named by the digest of all that decides them. Any may be missing at any time."""
+    """Folder for results per item (for example per frame), for all later runs of this stage in the store.
+    A file is written atomically and named by the digest of everything that decides its content. Any file may
+    be deleted at any time.
+    """
     seed: int
     device: Device
     threads: int
     reporter: Reporter
     expected: Mapping[str, Estimate] = field(default_factory=dict)
-    """When a cost is estimated: what the upstream stages expect that are not in ``inputs`` yet."""
+    """Only for `Stage.estimate`: estimates of the upstream stages that are not in ``inputs`` yet."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """The sections of the stages that the stage names in ``SETTINGS``."""
+    """Settings of the upstream stages that are listed in `Stage.SETTINGS`, by stage."""
 
 
 @dataclass(frozen=True)
 class StageResult:
-    """How a stage ended."""
+    """Result of `Stage.run`."""
 
     missing: tuple[str, ...] = ()
-    """What could not be made, one line each; not empty means that the stage is done only in part."""
+    """Outputs that could not be made, one line each. If there are any, the stage is done only in part."""
     summary: Mapping[str, Any] = field(default_factory=dict)
-    """Figures for ``manifest.json`` and ``cleargs show`` (JSON values; outputs hold no clock times)."""
+    """Figures for ``manifest.json`` and ``cleargs show``: JSON values, without clock times."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a stage is expected to take, said before work starts."""
+    """Expected cost of a stage."""
 
     minutes: float
     memory_gb: float
     disk_gb: float
     frames: int = 0
-    """Frames that the stage will publish; 0 where it publishes none."""
+    """Number of frames that the stage will publish; 0 if it publishes none."""
     megapixels: float = 0.0
-    """Of one of them."""
+    """Size of one of these frames."""
 
     def at_pace(self, pace: float) -> Estimate:
-        """Where all takes ``pace`` times as long."""
+        """Return the estimate for a machine that takes ``pace`` times as long."""
         return replace(self, minutes=pace * self.minutes)
 
 
 class Stage(Protocol):
-    """A module in ``stages/``. Its top level imports only its config model: heavy imports live in ``run``,
-    so that a run with nothing to do costs no import of torch.
+    """A module in ``stages/``.
+
+    At its top level it imports only its config model. Heavy imports are inside ``run``, so that a run with
+    nothing to do does not import torch.
     """
 
     VERSION: int
-    """Raised whenever the stage's source changes its results."""
+    """Number to increase with every change of the source that changes results."""
     CONFIG: type[BaseModel]
     SETTINGS: tuple[str, ...]
-    """Upstream stages whose settings hold for this one too; they enter the key."""
+    """Upstream stages whose settings this stage also uses. They are part of the key."""
     INPUTS: Mapping[str, tuple[str, ...]]
-    """Upstream stage -> files and folders in it that this stage reads; their digests enter the key."""
+    """Upstream stage -> its files and folders that this stage reads. Their digests are part of the key."""
     OUTPUTS: tuple[str, ...]
-    """Files and folders that exist when the stage is done."""
+    """Files and folders that the stage writes."""
     LEFTOVERS: tuple[str, ...]
-    """Patterns of the files in ``out`` from which it resumes after a killed try (``*`` within one name).
-    Whatever else such a try left there is thrown away."""
+    """Glob patterns of the files in ``out`` from which the stage resumes after a killed attempt. All other
+    files of that attempt are deleted.
+    """
     LIBRARIES: tuple[str, ...]
-    """Distributions whose version changes results; their versions enter the key. A stage may also have a
-    function ``other_libraries(device)``: name -> version of what computes on that device only."""
+    """Distributions that affect the results. Their versions are part of the key. A stage may also have a
+    function ``other_libraries(device)``, which returns name -> version of those that only this device uses.
+    """
 
     def externals(self, config: Any, source: Path) -> Mapping[str, External]:
-        """Role -> files outside the store whose content enters the key (capture, model weights)."""
+        """Return role -> files outside the store whose content is part of the key (e.g. models)."""
 
     def preflight(self, config: Any) -> None:
-        """Raise InputError when a model or a server that the settings name cannot be had.
+        """Raise InputError if a model or a server that the settings name is unavailable.
 
-        Asked before the first stage of a run starts: hours of work are not to end in a missing file.
+        The runner calls this for all stages before it starts the first: hours of work should not end in a
+        missing file.
         """
 
     def estimate(self, context: StageContext[Any]) -> Estimate:
-        """Rough cost, from the settings and the inputs that already exist."""
+        """Estimate the cost from the settings and from the inputs that already exist."""
 
     def run(self, context: StageContext[Any]) -> StageResult:
-        """Do the work: read ``context.inputs``, write ``OUTPUTS`` into ``context.out``."""
+        """Read ``context.inputs`` and write ``OUTPUTS`` into ``context.out``."""

@@ -1,15 +1,17 @@
-"""The store: finished stage folders by content key, unfinished work next to them.
+"""The store: finished results of stages by content key, and unfinished work.
 
 ::
 
-    STORE/<stage>/<key>/                   finished: every output and manifest.json; never written again
-    STORE/work/<key>/{out,checkpoints}/    unfinished: survives kill -9, the next try resumes from it
-    STORE/locks/<key>.lock                 held by the one process that works on the key, with its name
-    STORE/kept/<stage>/                    findings about single items, by digest; safe to delete
-    STORE/locks/store.lock  STORE/roots/  STORE/digests.sqlite
+    STORE/<stage>/<key>/                   finished: all outputs and manifest.json; outputs never change
+    STORE/work/<key>/{out,checkpoints}/    unfinished: survives kill -9; the next attempt resumes from it
+    STORE/locks/<key>.lock                 lock of the process that works on the key; the file names it
+    STORE/kept/<stage>/                    cache of results per item, by digest; safe to delete
+    STORE/locks/store.lock                 shared lock of all processes that use the store
+    STORE/roots/                           the runs that use the store
+    STORE/digests.sqlite                   digests of files that were read before
 
-On a file system without locks each process works in its own folder, ``<key>@<process>``. Several may make the
-same results, and the rename decides.
+On a file system without locks, each process works in its own folder, ``<key>@<process>``. If several make the
+same results, the first rename into ``STORE/<stage>/`` wins.
 """
 
 from __future__ import annotations
@@ -35,47 +37,46 @@ from cleargs.manifest import (
     read_manifest,
     write_manifest,
 )
-from cleargs.pipeline.lock import file_lock, is_locked, only_one
+from cleargs.pipeline.lock import exclusive_lock, file_lock, is_locked
 from cleargs.progress import Reporter
 from cleargs.safe_io import FAULTS, read_text
 
 STORE_FOLDER = ".store"
-"""Where a run keeps its store unless told otherwise."""
+"""Folder of the store in a run, by default."""
 
 ROOTS = "roots"
-"""Folder in a store that notes the runs which use it."""
+"""Folder in a store with one file per run that uses it."""
 
 SECONDS = "seconds"
-"""File in a work folder: how long the tries before took."""
-
+"""File in a work folder with the time that earlier attempts took, in seconds."""
 
 Kind = Literal["finished", "unfinished", "kept", "rubbish"]
-"""What a folder holds that nothing needs."""
+"""Content of a folder that `Store.collect` may remove."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What the store holds for one key."""
+    """The results in the store for one key."""
 
     folder: Path
     manifest: Manifest | None
     damage: str | None = None
-    """Why the folder cannot be used; None when every file is what the manifest says."""
+    """Reason why the results cannot be used; None if all files match the manifest."""
 
     @property
     def usable(self) -> Manifest | None:
-        """The manifest, where nothing is damaged."""
+        """The manifest, or None if something is damaged."""
         return self.manifest if self.damage is None else None
 
     @property
-    def whole(self) -> Manifest | None:
-        """The manifest, where nothing is damaged and the stage left nothing out."""
+    def complete(self) -> Manifest | None:
+        """The manifest, or None if something is damaged or missing."""
         return self.usable if self.usable is not None and not self.usable.missing else None
 
 
 @dataclass(frozen=True)
 class WorkFolder:
-    """Where one key is being worked on."""
+    """Folder with the unfinished work on one key."""
 
     folder: Path
 
@@ -86,25 +87,25 @@ class WorkFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """In-stage state, never published."""
+        """Intermediate state of the stage, never published."""
         return self.folder / "checkpoints"
 
     @property
     def seconds(self) -> float:
-        """What earlier tries of the same work took, as far as they could say."""
+        """Time that earlier attempts at this work took, as far as it was noted; in seconds."""
         try:
             return float((self.folder / SECONDS).read_text(encoding="ascii"))
         except (OSError, ValueError):
             return 0.0
 
     def note_seconds(self, seconds: float) -> None:
-        """Keep the time that all tries took so far; a disk that is full loses it."""
+        """Write the time that all attempts took so far. On a full disk, it is lost."""
         with suppress(OSError):
             (self.folder / SECONDS).write_text(f"{seconds:.3f}", encoding="ascii")
 
 
 class Store:
-    """A folder of finished results, which runs and processes may share."""
+    """A folder of results, which several runs and processes may share."""
 
     def __init__(self, root: Path, memo: DigestMemo) -> None:
         self.root = root
@@ -113,11 +114,15 @@ class Store:
     # -- reading ---------------------------------------------------------------------------------------
 
     def folder(self, stage: str, key: str) -> Path:
-        """Where the finished results of ``key`` lie, or would."""
+        """Return the folder for the finished results of ``key``, which need not exist."""
         return self.root / stage / key
 
     def find(self, stage: str, key: str) -> Entry | None:
-        """What is stored under ``key``, checked: sizes always, digests through the memo; None for nothing."""
+        """Return the results of ``key`` after a check, or None if there are none.
+
+        The check compares the size of every file with the manifest. It compares the digests too, but reads
+        only files that changed since the memo read them.
+        """
         folder = self.folder(stage, key)
         try:
             manifest = read_manifest(folder)
@@ -133,9 +138,9 @@ class Store:
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Held by whoever works in the store, so that nothing is cleared away under its feet.
+        """Hold a shared lock, so that ``cleargs gc`` in another process cannot remove data in use.
 
-        In somebody else's store that may only be read there is nothing to hold: its results can be shown.
+        A read-only store has no lock. Its results can still be shown.
         """
         if self._only_readable():
             yield
@@ -145,54 +150,59 @@ class Store:
 
     @contextmanager
     def lock(self, key: str, reporter: Reporter, stage: str) -> Iterator[bool]:
-        """Hold the work on ``key``; wait while another process has it, and say which one.
+        """Hold the lock of ``key``; report another holder and wait for it.
 
-        Yields whether this process is alone: a file system without locks keeps nobody apart.
+        Yields True with the lock, and False on a file system without locks, where other processes may work
+        on the same key. Raises StoreError if the store is read-only.
         """
         if self._only_readable():
             raise StoreError(
-                f"{stage} is to be made, but the store {self.root} may only be read",
-                hint="choose a --store of your own",
+                f"{stage} has no results yet, and the store {self.root} is read-only",
+                hint="choose another folder with --store",
             )
-        with only_one(self.root / "locks" / f"{key}.lock", reporter, stage) as alone:
+        with exclusive_lock(self.root / "locks" / f"{key}.lock", reporter, stage) as locked:
             try:
-                yield alone
-            finally:  # this process's own work folders are left to the next try
+                yield locked
+            finally:  # without its suffix, the next attempt finds the work folder of this process
                 for folder in (self.root / "work").glob(f"{key}*{self._owner_suffix()}"):
-                    with suppress(OSError):  # another process left something there already
+                    with suppress(OSError):  # there is already one of another process
                         folder.rename(folder.with_name(folder.name.removesuffix(self._owner_suffix())))
 
     def _only_readable(self) -> bool:
         return self.root.is_dir() and not os.access(self.root, os.W_OK)
 
     def _owner_suffix(self) -> str:
-        """The ending of this process's own work folders, where no lock keeps another one out."""
+        """Return the suffix of this process's work folders on a file system without locks."""
         return f"@{socket.gethostname()}-{os.getpid()}"
 
     def open_work(
         self,
         key: str,
         *,
-        fresh: bool,
+        forced: bool,
         entry: Entry | None,
         leftovers: Sequence[str] = (),
-        alone: bool = True,
+        locked: bool = True,
     ) -> WorkFolder:
-        """The work folder of ``key``, ready to resume: of the outputs that dead writers left, only those stay
-        that match one of the patterns ``leftovers``. Where this process is not ``alone``, the folder is its
-        own.
+        """Prepare the work folder of ``key``.
 
-        A forced rebuild (``fresh``) has a folder of its own, which resumes only from an interrupted forced
-        try. What a partial ``entry`` already holds is carried over once.
+        Args:
+            key: The key of the stage.
+            forced: A forced rebuild. It has a separate work folder, which resumes only from a forced attempt.
+            entry: Results in the store. Usable ones are copied to the outputs unless ``forced``, or unless
+                the work folder already has outputs.
+            leftovers: Glob patterns of the outputs to keep from a killed attempt; all others are deleted.
+            locked: This process holds the lock of ``key``. Otherwise it works in its own folder, which takes
+                over the common one if there is one.
         """
-        work = WorkFolder(self.root / "work" / (f"{key}.forced" if fresh else key))
+        work = WorkFolder(self.root / "work" / (f"{key}.forced" if forced else key))
         with disk_errors(work.folder):
-            if not alone:
+            if not locked:
                 left, work = work, WorkFolder(work.folder.with_name(work.folder.name + self._owner_suffix()))
-                with suppress(OSError):  # nothing is there, or another process took it
+                with suppress(OSError):  # there is none, or another process took it over
                     left.folder.rename(work.folder)
             _keep_only(work.out, leftovers)
-            if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
+            if entry is not None and entry.usable is not None and not forced and not work.out.exists():
                 _link_files(entry.folder, work.out)
             work.out.mkdir(parents=True, exist_ok=True)
             work.checkpoints.mkdir(parents=True, exist_ok=True)
@@ -203,26 +213,29 @@ class Store:
         return work
 
     def publish(self, work: WorkFolder, manifest: Manifest) -> Manifest:
-        """Move the outputs of ``work`` to their final place: all or nothing, and durable.
+        """Move the outputs of ``work`` to their final folder, atomically and durably.
 
-        Where a whole result with the same content is already there, ours is dropped and that one's manifest
-        returned. A partial, damaged or differing one makes room.
+        Complete results with equal content that are already there are kept, and the outputs of ``work`` are
+        dropped. Partial, damaged or different ones are replaced.
+
+        Returns:
+            The manifest of the results in the final folder.
         """
         final = self.folder(manifest.stage, manifest.key)
         with disk_errors(final):
             write_manifest(work.out, manifest)
             sync_tree(work.out)
             final.parent.mkdir(parents=True, exist_ok=True)
-            there = self.find(manifest.stage, manifest.key)
-            if there is not None:
-                if there.whole is not None and there.whole.digest == manifest.digest:
+            existing = self.find(manifest.stage, manifest.key)
+            if existing is not None:
+                if existing.complete is not None and existing.complete.digest == manifest.digest:
                     self.discard(work.folder)
-                    return there.whole
+                    return existing.complete
                 self.discard(final)
             try:
                 work.out.rename(final)
             except OSError:
-                # Another writer published in this moment (on a file system without locks): it won.
+                # On a file system without locks, another process published in the meantime: it won.
                 winner = self.find(manifest.stage, manifest.key)
                 if winner is None or winner.usable is None:
                     raise
@@ -232,12 +245,12 @@ class Store:
         for name, record in manifest.files.items():
             self.memo.remember(final / name, record.digest)
         if not manifest.missing:
-            with suppress(StoreError):  # the result is there, whatever becomes of what is left
+            with suppress(StoreError):  # the result is published; its work folder no longer matters
                 self.discard(work.folder)
         return manifest
 
     def discard(self, folder: Path) -> None:
-        """Take ``folder`` away in one step, then delete it at leisure."""
+        """Rename ``folder`` in one step, so that no process uses it any more, then delete it."""
         rubbish = self.root / "work" / f".rubbish-{folder.name}-{os.getpid()}"
         rubbish.parent.mkdir(parents=True, exist_ok=True)
         with disk_errors(folder), suppress(FileNotFoundError):
@@ -245,13 +258,13 @@ class Store:
         shutil.rmtree(rubbish, ignore_errors=True)
 
     def cache_folder(self, stage: str) -> Path:
-        """Where ``stage`` keeps what it found out about single items."""
+        """Return the folder for results per item of ``stage`` (`StageContext.cache`)."""
         return self.root / "kept" / stage
 
     # -- links from runs -------------------------------------------------------------------------------
 
     def link(self, run: Path, stage: str, key: str) -> None:
-        """Let ``RUN/<stage>`` show the finished folder: a link replaced by rename, relative inside RUN."""
+        """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN."""
         target = self.folder(stage, key)
         if target.is_relative_to(run):
             target = target.relative_to(run)
@@ -260,7 +273,7 @@ class Store:
             return
         if link.exists() and not link.is_symlink():
             raise StoreError(
-                f"{link} is a folder, not a link into the store", hint="move it away, or choose another -o"
+                f"{link} is a folder, not a link into the store", hint="move it, or choose another -o"
             )
         temporary = run / f".{stage}.link-{os.getpid()}"
         with disk_errors(link):
@@ -270,14 +283,14 @@ class Store:
             hidden_link(run, stage).unlink(missing_ok=True)
 
     def unlink(self, run: Path, stage: str) -> None:
-        """Let ``RUN/<stage>`` show nothing. What it showed stays in the store, and known to `last_shown`."""
+        """Remove the link ``RUN/<stage>``. The results stay in the store; `last_shown` still finds them."""
         link = run / stage
         if link.is_symlink():
-            with suppress(FileNotFoundError):  # another process did it
+            with suppress(FileNotFoundError):  # another process removed it
                 link.replace(hidden_link(run, stage))
 
     def add_root(self, run: Path) -> None:
-        """Note that ``run`` links into this store, so that `collect` keeps what it shows."""
+        """Note that ``run`` uses this store, so that `collect` keeps the results that it links to."""
         name = hashlib.sha256(str(run).encode()).hexdigest()[:16]
         note = self.root / ROOTS / name
         if not note.exists() and not self._only_readable():
@@ -285,21 +298,29 @@ class Store:
                 note.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(note, f"{run}\n".encode())
 
-    # -- clearing --------------------------------------------------------------------------------------
+    # -- removing --------------------------------------------------------------------------------------
 
     def collect(self, stages: tuple[str, ...], *, checkpoints: bool, dry_run: bool) -> list[Garbage]:
-        """Remove the finished folders that no run links to; with ``checkpoints`` unfinished work and what is
-        kept about single items too.
+        """Remove finished results that no run links to, and the remains of deleted folders.
 
-        Raises StoreError when a run is at work in the store, or where the file system cannot tell.
+        Args:
+            stages: Names of all stages.
+            checkpoints: Also remove unfinished work and the cache of results per item.
+            dry_run: Remove nothing.
+
+        Returns:
+            The folders that are removed, or would be.
+
+        Raises:
+            StoreError: A process uses the store, or the file system cannot tell.
         """
-        with file_lock(self.root / "locks" / "store.lock", wait=False) as alone:
-            if alone is False:
-                raise StoreError("a run is at work in this store", hint="try again when it is done")
-            if alone is None and not dry_run:
+        with file_lock(self.root / "locks" / "store.lock", wait=False) as locked:
+            if locked is False:
+                raise StoreError("a run is using this store", hint="try again when the run has ended")
+            if locked is None and not dry_run:
                 raise StoreError(
-                    f"the file system of {self.root} has no locks, which would keep data in use",
-                    hint="when no run works there, delete the folders that --dry-run lists",
+                    f"the file system of {self.root} has no locks, which would protect data in use",
+                    hint="when no run uses the store, delete the folders that --dry-run lists",
                 )
             runs = [self.root.parent] if self.root.name == STORE_FOLDER else []
             for note in (self.root / ROOTS).glob("*"):
@@ -334,7 +355,7 @@ class Store:
 
 @dataclass(frozen=True)
 class Garbage:
-    """A folder that nothing needs."""
+    """A folder that `Store.collect` may remove."""
 
     folder: Path
     kind: Kind
@@ -342,33 +363,33 @@ class Garbage:
 
 
 def writer_is_alive(work: Path) -> bool:
-    """Return True if a process works in the work folder ``work``."""
+    """Return True if a process is using the work folder ``work``."""
     key = work.name.partition("@")[0].removesuffix(".forced")
     return work.is_dir() and is_locked(work.parent.parent / "locks" / f"{key}.lock")
 
 
 def _keep_only(out: Path, patterns: Sequence[str]) -> None:
-    """Leave nothing in ``out`` but files that match a pattern, and their folders."""
-    known = {file for pattern in patterns for file in out.glob(pattern)}
-    for place in sorted(out.rglob("*"), reverse=True):  # what is in a folder before the folder
+    """Delete everything in ``out`` except files that match a pattern, and their folders."""
+    kept = {file for pattern in patterns for file in out.glob(pattern)}
+    for place in sorted(out.rglob("*"), reverse=True):  # the content of a folder before the folder
         if place.is_dir() and not place.is_symlink():
             if not any(place.iterdir()):
                 place.rmdir()
-        elif place not in known or not place.is_file() or is_partial(place):
+        elif place not in kept or not place.is_file() or is_partial(place):
             place.unlink()
 
 
 def _link_files(source: Path, target: Path) -> None:
-    """Bring the files of ``source`` into ``target`` without copying their content where hard links work.
+    """Link the files of ``source`` into the new folder ``target``; copy them where hard links are impossible.
 
-    Stages replace files by rename and never write into one, so that the source stays as it was. The copy is
-    made next to its place, so that a killed one is not mistaken for a whole one.
+    Links are safe, because stages replace files by rename and never write into an existing one. The final
+    rename keeps a killed copy from being mistaken for a complete one.
     """
-    beside = target.with_name(f"{target.name}.carried")
-    shutil.rmtree(beside, ignore_errors=True)
+    temporary = target.with_name(f"{target.name}.carried")
+    shutil.rmtree(temporary, ignore_errors=True)
     try:
-        shutil.copytree(source, beside, copy_function=os.link)
-    except OSError:  # shutil.Error is one
-        shutil.rmtree(beside)
-        shutil.copytree(source, beside)
-    beside.rename(target)
+        shutil.copytree(source, temporary, copy_function=os.link)
+    except OSError:  # includes shutil.Error
+        shutil.rmtree(temporary)
+        shutil.copytree(source, temporary)
+    temporary.rename(target)

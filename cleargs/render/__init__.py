@@ -1,1 +1,1 @@
-"""Pictures and films of a finished scene: where the camera goes, and what is written."""
+"""Images and films of a finished scene: camera paths and output files."""

@@ -1,4 +1,4 @@
-"""What is written of a scene: a still, a folder of stills, or a film. Pictures are made one by one."""
+"""Output of renders: a still, a folder of stills, or a film. Images are rendered one by one."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ Kind = Literal["film", "still", "folder"]
 
 _NUMBER = re.compile(r"%0?\d*d")
 _OPAQUE = 1 / 255
-"""Alpha from which a pixel has a depth."""
+"""Alpha from which a pixel has a depth: one level of an 8-bit image."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture to make."""
+    """One image to render."""
 
     camera: Camera
     filmed: Path | None = None
-    """The frame of the capture to lay on its left."""
+    """Raw frame to show on the left of the render."""
 
 
 class ShotRenderer(Viewer):
     """Renders shots of one scene."""
 
     def picture(self, shot: Shot) -> ImageU8:
-        """What ``shot`` shows; of twice the width where it has a frame of the capture beside it."""
+        """Render ``shot``. The image is twice as wide if the shot has a raw frame, which is on the left."""
         rendered = self.view(shot.camera)
         if shot.filmed is None:
             return rendered
         return np.concatenate([_fitted(read_rgb(shot.filmed), *rendered.shape[:2]), rendered], axis=1)
 
     def write(self, path: Path, shot: Shot) -> None:
-        """Write a still: a PNG of `picture`, or an EXR of the view over black.
+        """Write a still: a PNG of `picture`, or an EXR of the render over black.
 
-        The EXR has alpha, and the mean depth along the optical axis in world units, 0 where nothing is seen.
+        The EXR also has alpha, and the mean camera z in world units (0 for transparent pixels) as depth.
         """
         if path.suffix.lower() != ".exr":
             write_rgb(path, self.picture(shot))
@@ -64,9 +64,10 @@ class ShotRenderer(Viewer):
 
 
 def kind_of(output: Path) -> Kind:
-    """What the name of ``output`` asks for: FILE.mp4, FILE.png or .exr, FOLDER/%04d.png or .exr.
+    """Return the kind of output for a file name: film (.mp4), still (.png, .exr) or folder (FOLDER/%04d.png).
 
-    Raises InputError for any other.
+    Raises:
+        InputError: for any other name.
     """
     suffix, numbers = output.suffix.lower(), len(_NUMBER.findall(output.name))
     if suffix == ".mp4" and not numbers:
@@ -74,19 +75,19 @@ def kind_of(output: Path) -> Kind:
     if suffix in (".png", ".exr") and numbers < 2:
         return "folder" if numbers else "still"
     raise InputError(
-        f"{output} has no ending that says what to write",
-        hint="end it with .mp4 (a film), .png or .exr (a still); FOLDER/%04d.png numbers stills",
+        f"{output} has no ending of a film or a still",
+        hint="end it with .mp4 (a film), .png or .exr (a still), or write numbered stills to FOLDER/%04d.png",
     )
 
 
 def require_free(output: Path, *, force: bool) -> None:
-    """Raise InputError when something is at ``output`` already that ``force`` does not replace.
+    """Raise InputError if ``output`` exists and ``force`` is not given.
 
-    A folder is never replaced: there may be more in it than our stills.
+    A folder is never replaced, since it may contain other files than our stills.
     """
     if kind_of(output) == "folder":
         if output.parent.exists():
-            raise InputError(f"{output.parent} exists already", hint="choose a folder that is not there yet")
+            raise InputError(f"{output.parent} exists already", hint="choose a new folder")
     elif output.exists() and not force:
         raise InputError(f"{output} exists already", hint="choose another name, or give --force")
 
@@ -94,16 +95,26 @@ def require_free(output: Path, *, force: bool) -> None:
 def write_shots(
     output: Path, scene: Scene, shots: Sequence[Shot], task: Task, *, fps: float, codec: Codec, device: str
 ) -> None:
-    """Write ``shots`` (of one size) to ``output``, which appears whole or not at all.
+    """Render shots and write them to ``output``, atomically. A folder of stills also gets ``cameras.json``.
 
-    Beside the stills of a folder lies their ``cameras.json``. Raises InputError when ``output`` cannot hold
-    them, StoreError when the disk is full or not writable.
+    Args:
+        output: File or pattern; see `kind_of`.
+        scene: The scene to render.
+        shots: Shots of one size.
+        task: Receives one step per shot.
+        fps: Frames per second of a film.
+        codec: Codec of a film.
+        device: cpu or cuda.
+
+    Raises:
+        InputError: if there are several shots for one still, or if the size does not fit the codec.
+        StoreError: if the disk is full or not writable.
     """
     kind, camera = kind_of(output), shots[0].camera
     if kind == "still" and len(shots) > 1:
         raise InputError(
-            f"{len(shots)} pictures do not fit into {output.name}",
-            hint=f"number them (FOLDER/%04d{output.suffix}), or write a film (.mp4)",
+            f"{output.name} can store only one image, not {len(shots)}",
+            hint=f"write numbered stills (FOLDER/%04d{output.suffix}) or a film (.mp4)",
         )
     if kind == "film":
         require_even(camera.width, camera.height)
@@ -134,11 +145,11 @@ def write_shots(
 
 
 def _fitted(image: ImageU8, height: int, width: int) -> ImageU8:
-    """``image`` at the place that `cleargs.render.paths.framed` gives its content, black around it."""
+    """Scale ``image`` to fit, with black borders, so that it matches `cleargs.render.paths.framed`."""
     scale = min(width / image.shape[1], height / image.shape[0])
     wide, high = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    small = cv2.resize(image, (wide, high), interpolation=way)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    small = cv2.resize(image, (wide, high), interpolation=interpolation)
     left, top = (width - wide) // 2, (height - high) // 2
     borders = (top, height - high - top, left, width - wide - left)
     return np.asarray(cv2.copyMakeBorder(small, *borders, cv2.BORDER_CONSTANT), np.uint8)

@@ -1,6 +1,6 @@
-"""The shots that are asked for of a run: a still, its path, a turntable, or the poses of a file.
+"""Shots of a run: a still, its camera path, a turntable, or the poses in a file.
 
-Such a file is ``cameras.json`` as `cleargs export` writes it, or ``transforms.json``.
+The file is a ``cameras.json`` as `cleargs export` writes it, or a ``transforms.json``.
 """
 
 from __future__ import annotations
@@ -27,24 +27,30 @@ from cleargs.splat.camera import Camera
 World = Literal["normalised", "input"]
 
 _OPENGL = np.array([1.0, -1.0, -1.0])
-"""By what the axes of an OpenCV camera are multiplied to be those of an OpenGL one."""
+"""Factors that turn the axes of an OpenCV camera into those of an OpenGL camera, and back."""
 _HINT = "give cameras.json as `cleargs export` writes it, or transforms.json as nerfstudio does"
 
 _NERFSTUDIO = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
-"""Field of transforms.json -> that of a camera."""
+"""Field of transforms.json -> field of a camera."""
 
 Size = tuple[int, int]
 
 
 class CaptureShots:
-    """Makes shots from the frames in ``ingest``, which have a pose.
+    """Creates shots from the frames with a pose in a prepared capture.
 
-    Pictures are of ``size``, or where that is None of the frames' size, an odd width or height one larger
-    where ``even``. Raises InputError when no frame has a pose.
+    Args:
+        ingest: Folder of the finished stage ``ingest``.
+        size: Width and height of the images in pixels (None: those of the frames).
+        even: Increase an odd width or height of the frames by one pixel.
+        side_by_side: Show the raw frame on the left of each render, where there is one.
+
+    Raises:
+        InputError: if no frame has a pose.
     """
 
     def __init__(self, ingest: Path, size: Size | None, *, even: bool, side_by_side: bool) -> None:
-        self._ingest, self._size, self._even, self._beside = ingest, size, even, side_by_side
+        self._ingest, self._size, self._even, self._side_by_side = ingest, size, even, side_by_side
         self._all = load_frames(ingest)
         self._frames = [frame for frame in self._all if frame.registered]
         if not self._frames:
@@ -53,56 +59,63 @@ class CaptureShots:
         self._lens = self._cameras[len(self._cameras) // 2]
 
     def still(self, frame_id: int | None) -> list[Shot]:
-        """At the pose of a frame; None: of the one in the middle of the capture."""
+        """Return a shot at the pose of a frame (None: the frame in the middle of the capture)."""
         numbers = [frame.frame_id for frame in self._frames]
-        wanted = numbers[len(numbers) // 2] if frame_id is None else frame_id
-        if wanted not in numbers:
-            there = any(frame.frame_id == wanted for frame in self._all)
+        number = numbers[len(numbers) // 2] if frame_id is None else frame_id
+        if number not in numbers:
+            exists = any(frame.frame_id == number for frame in self._all)
             raise InputError(
-                f"frame {wanted} {'has no pose' if there else 'is not in this capture'}",
+                f"frame {number} {'has no pose' if exists else 'is not in this capture'}",
                 hint=f"choose one from {numbers[0]} to {numbers[-1]}",
             )
-        index = numbers.index(wanted)
+        index = numbers.index(number)
         return self._shots([self._cameras[index]], [self._frames[index]])
 
     def path(self, count: int) -> list[Shot]:
-        """``count`` pictures along the smoothed path of the capture, at equal steps."""
+        """Return ``count`` shots at equal steps along the smoothed path of the capture."""
         poses, nearest = smooth_path(self._cameras, count)
         cameras = [replace(self._lens, world_to_camera=pose) for pose in poses]
         return self._shots(cameras, [self._frames[index] for index in nearest])
 
     def turntable(self, count: int) -> list[Shot]:
-        """``count`` pictures of a full turn around what the cameras look at."""
+        """Return ``count`` shots around the point that the cameras look at."""
         poses = turntable(self._cameras, count)
         return self._shots([replace(self._lens, world_to_camera=pose) for pose in poses])
 
     def poses(self, path: Path, world: World | None) -> list[Shot]:
-        """A picture at each pose that the file ``path`` lists; see `read_poses`."""
+        """Return one shot per pose in the file ``path``; see `read_poses`."""
         manifest = linked_manifest(self._ingest.parent, self._ingest.name)
         similarity = Similarity.from_json(manifest and manifest.summary.get("similarity"), self._ingest)
         return self._shots(read_poses(path, self._lens, similarity, world))
 
     def _shots(self, cameras: Sequence[Camera], filmed: Sequence[Frame] = ()) -> list[Shot]:
-        """All of one size, each with the frame beside it where that is asked for."""
+        """Return shots of one size, with the frames ``filmed`` next to them if the user wants that."""
         width, height = self._size or (cameras[0].width, cameras[0].height)
         if self._size is None and self._even:
             width, height = width + width % 2, height + height % 2
         if width * height > MAX_PIXELS:
-            raise InputError(f"{width}x{height} pixels are too many", hint="give a smaller --size")
-        images = [self._ingest / frame.image for frame in filmed] if self._beside else [None] * len(cameras)
+            raise InputError(
+                f"an image of {width}x{height} pixels is too large", hint="give a smaller --size"
+            )
+        images = (
+            [self._ingest / frame.image for frame in filmed] if self._side_by_side else [None] * len(cameras)
+        )
         return [
             Shot(framed(camera, width, height), image) for camera, image in zip(cameras, images, strict=True)
         ]
 
 
 def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | None = None) -> list[Camera]:
-    """The cameras that ``path`` lists, in its order, in the run's normalised world.
+    """Read the cameras of a ``cameras.json`` or ``transforms.json``, in normalised coordinates.
 
-    What an entry does not say of its lens is that of ``lens``; distortion is passed over, since a render has
-    none. ``similarity`` leads from the input's world, in which transforms.json is taken to be, to the
-    normalised one, in which cameras.json is; ``world`` says otherwise.
+    Args:
+        path: The file.
+        lens: Camera whose size and intrinsics replace missing ones. Distortion is ignored.
+        similarity: Transform from the coordinates of the input to normalised coordinates.
+        world: Coordinates of the file (default: normalised for cameras.json, input for transforms.json).
 
-    Raises InputError for a file of another form, or a pose that is no rotation and translation.
+    Raises:
+        InputError: if the file has another form, or if a pose is not a rotation and a translation.
     """
     try:
         document = read_json(path)
@@ -115,28 +128,28 @@ def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | 
                 _of_transforms({**document, **entry}, lens, f"frame {n}") for n, entry in enumerate(frames)
             ]
         if not listed:
-            raise ValueError("it lists no pose")
+            raise ValueError("it has no poses")
     except InputError as error:
         raise InputError(f"{path}: {error}", hint=error.hint) from error
     except FAULTS as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
     cameras = []
     for camera, pose in listed:
-        moved = pose if (world or usual) == "normalised" else similarity.pose(pose)
-        matrix = np.vstack([np.column_stack([moved.rotation, moved.translation]), [0.0, 0.0, 0.0, 1.0]])
+        placed = pose if (world or usual) == "normalised" else similarity.pose(pose)
+        matrix = np.vstack([np.column_stack([placed.rotation, placed.translation]), [0.0, 0.0, 0.0, 1.0]])
         cameras.append(replace(camera, world_to_camera=matrix))
     return cameras
 
 
 def _of_cameras_json(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[Camera, Pose]:
-    """An entry in the layout of the Inria code: the camera's position, and its axes in the world."""
+    """Read an entry in the layout of the Inria code: position and axes of the camera in the world."""
     axes = np.array(entry["rotation"], np.float64).reshape(3, 3) * _OPENGL
     matrix = np.column_stack([axes, np.array(entry["position"], np.float64).reshape(3)])
     return _with_lens(lens, entry), rigid_pose(matrix, name, _HINT)
 
 
 def _of_transforms(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[Camera, Pose]:
-    """An entry of nerfstudio's: an OpenGL camera-to-world matrix, the lens next to it or for all."""
+    """Read an entry of nerfstudio: an OpenGL camera-to-world matrix, and intrinsics if it has any."""
     matrix = np.array(entry["transform_matrix"], np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"the transform_matrix of {name} is not 4x4")
@@ -148,7 +161,7 @@ def _of_transforms(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[C
 
 
 def _with_lens(lens: Camera, entry: Mapping[str, Any]) -> Camera:
-    """``lens`` with the size, focal lengths and principal point of ``entry``, as far as they are there."""
+    """Return ``lens`` with those of size, focal lengths and principal point that ``entry`` has."""
     scaled = lens.resized(int(entry.get("width", lens.width)), int(entry.get("height", lens.height)))
     numbers: dict[str, Any] = {name: float(entry[name]) for name in ("fx", "fy", "cx", "cy") if name in entry}
     if "fx" in numbers:

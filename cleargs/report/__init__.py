@@ -1,1 +1,1 @@
-"""What a person looks at: contact sheets."""
+"""Reports for users: the page of a run, its live server, and the picture of the allocation."""

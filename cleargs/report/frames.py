@@ -1,7 +1,4 @@
-"""The frames of a report: the rows of its strip, joined from the tables of the stages, and their pictures.
-
-The pictures are JPEGs of what was filmed, of what the scene shows there, and of the repairs.
-"""
+"""The frames of a report: their data from the tables of the stages, and their images as JPEG files."""
 
 from __future__ import annotations
 
@@ -30,75 +27,76 @@ from cleargs.splat.render import Viewer
 from cleargs.types import ImageU8
 
 HELD_OUT, UNPLACED = "held out", "not placed"
-"""Roles of frames on which RVA has nothing to say."""
+"""Roles, on the page, of frames that RVA does not rate."""
 
 CHOICES = {
     "render": "the render",
     "restored": "the restored frame",
-    "fused": "render and restored frame, fused",
+    "fused": "the fusion of render and restored frame",
     "observed": "none: the raw frame is kept",
 }
+"""Candidate -> its description in the report."""
 
 MEANINGS = {column.name: column.metadata[b"meaning"].decode() for column in FORMATION}
-"""Column of ``formation.parquet`` -> what it means."""
+"""Column of ``formation.parquet`` -> its meaning."""
 
 
 @dataclass(frozen=True)
 class FrameRow:
-    """One frame, and what the stages say of it."""
+    """One frame, with the results of the stages for it."""
 
     frame: Frame
     judged: Mapping[str, Any] = field(default_factory=dict)
-    """Its row of ``rva/frames.parquet``; empty without one."""
+    """The row of the frame in ``rva/frames.parquet``; empty without one."""
     rounds: tuple[Selection, ...] = ()
-    """Its rows of ``rivr/selection.parquet``, in the order of the rounds."""
+    """The rows of the frame in ``rivr/selection.parquet``, in the order of the rounds."""
     affine: NDArray[np.float64] | None = None  # [3, 4]
-    """The colours of the last scene to those of the frame; None without compensation."""
+    """Transform of sRGB colours from the last scene to the frame; None without exposure compensation."""
     formation: Mapping[str, Any] = field(default_factory=dict)
-    """Column of the last scene's ``formation.parquet`` -> value; empty without one."""
+    """Column of ``formation.parquet`` of the last scene -> value; empty without one."""
 
     @property
     def role(self) -> str:
-        """RVA's, or one of the two above; "" where it is unknown."""
+        """Role by RVA, `HELD_OUT` or `UNPLACED`; "" if it is unknown."""
         if not self.frame.registered:
             return UNPLACED
         return HELD_OUT if self.frame.split != "train" else str(self.judged.get("role", ""))
 
     @property
     def weight(self) -> float | None:
-        """Weight of its raw supervision, 0 to 1."""
+        """Weight of the raw frame in training, from 0 to 1."""
         return self.judged.get("weight")
 
     @property
     def selection(self) -> Selection | None:
-        """Its row of the latest round."""
+        """Row of the latest round."""
         return self.rounds[-1] if self.rounds else None
 
     @property
     def chosen(self) -> str | None:
-        """The layer of the latest round that supervises the frame."""
+        """Candidate of the latest round that the training uses; None if it was refused."""
         if self.selection is None:
             return None
-        kept = self.selection.accepted or self.selection.chosen == "observed"
-        return self.selection.chosen if kept else None
+        used = self.selection.accepted or self.selection.chosen == "observed"
+        return self.selection.chosen if used else None
 
     @property
     def gain_ev(self) -> float | None:
-        """Exposure next to the scene's at middle grey, stops; None without compensation."""
+        """Exposure relative to the scene at middle grey, in stops; None without compensation."""
         if self.affine is None:
             return None
         grey = self.affine[:, :3].sum(axis=1) * 0.5 + self.affine[:, 3]
-        # sRGB to linear light near middle grey is a power of 2.4 or so; a stop is a factor of two there.
+        # Near middle grey, linear light is about the sRGB value to the power of 2.4. A stop is a factor of 2.
         return 2.4 * math.log2(max(float(grey.mean()), 1e-3) / 0.5)
 
     def motion(self, name: Literal["blur_px", "skew_px"]) -> float | None:
-        """The way of the pixels while exposed, or of the last line of pixels against the first."""
+        """Return the fitted motion blur, or the rolling shutter between first and last line, in pixels."""
         found: float | None = self.formation.get(name, getattr(self.selection, name, None))
         return found
 
 
 def scores_of(selection: Selection) -> list[tuple[str, dict[str, float]]]:
-    """Name of the scorer, and candidate -> score: of the one that decides, then of that for ties."""
+    """Return the deciding scorer, then the scorer for ties, each as (name, candidate -> score)."""
     found = []
     for use in ("primary", "tiebreak"):
         scores = {name: getattr(selection, f"{use}_{name}") for name in CHOICES}
@@ -108,16 +106,27 @@ def scores_of(selection: Selection) -> list[tuple[str, dict[str, float]]]:
 
 
 SCENES = ("g0", "rivr", "consolidate")
-"""The stages that make a scene, in order."""
+"""Stages that train a scene, in order."""
 
 
 def last_scene(stages: Collection[str]) -> str | None:
-    """The last of ``stages`` that makes a scene; None without one."""
+    """Return the last of ``stages`` that trains a scene; None without one."""
     return next((stage for stage in reversed(SCENES) if stage in stages), None)
 
 
 def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
-    """The frames of ``run`` in their order, as far as ``stages`` say something of them. Raises StoreError."""
+    """Read the data of all frames of a run.
+
+    Args:
+        run: The run folder.
+        stages: The finished stages.
+
+    Returns:
+        One row per frame, in the order of the capture.
+
+    Raises:
+        StoreError: if a table cannot be read.
+    """
     judged: dict[int, dict[str, Any]] = {}
     if "rva" in stages:
         rows = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
@@ -127,7 +136,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
         for found in sorted(read_selection(run / "rivr" / "selection.parquet"), key=lambda row: row.round):
             rounds.setdefault(found.frame_id, []).append(found)
     affines: dict[int, NDArray[np.float64]] = {}
-    formation: dict[int, dict[str, Any]] = {}  # a scene may be trained without asking what the camera did
+    formation: dict[int, dict[str, Any]] = {}  # stays empty if image formation is off
     if final := last_scene(stages):
         exposure = read_exposure(run / final / "exposure.parquet")
         if exposure.enabled:
@@ -147,40 +156,42 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
 
 
 def camera_of(frame: Frame) -> Camera:
-    """The camera of a registered frame."""
+    """Return the camera of a frame with a pose."""
     return view_of(frame, Path(), 0.0).camera
 
 
-# -- pictures ------------------------------------------------------------------------------------------------
+# -- images --------------------------------------------------------------------------------------------------
 
 
 LAYERS = {
     "observed": "As filmed",
-    "explained": "As the scene explains it",
-    "deblurred": "Motion undone",
+    "explained": "Render with camera effects",
+    "deblurred": "Deblurred",
     "restored": "Restored",
     "fused": "Fused",
-    "render": "Scene, before",
+    "render": "Scene before repair",
     "final": "Final scene",
 }
-"""Layers in the order shown -> what the page calls them."""
+"""Layer -> its label on the page, in the order of the page."""
 
 FOLDER = "frames"
-BYTES = 8_500_000
-"""About how much all layers together may take."""
+IMAGE_BYTES = 8_500_000
+"""Approximate limit for the total size of all layers."""
 
-_BYTES_PER_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
-_THUMBNAIL, _QUALITY = 240, 84
+_BYTES_PER_PIXEL = 0.18  # in JPEG files at _QUALITY
+_SIDE_MAX, _SIDE_MIN = 960, 240  # limits of the long side of a layer, px
+_THUMBNAIL, _QUALITY = 240, 84  # long side, px; JPEG quality
 
-RENDERED = 40
-"""Most frames at which the final scene is rendered, evenly along the trajectory: more would take too long."""
+MAX_RENDERED = 40
+"""Maximum number of frames, evenly along the trajectory, for which the final scene is rendered. It limits the
+time."""
 
 
 class ImageFile(NamedTuple):
-    """A picture of the report, with the size it has."""
+    """An image file of the report, with its size in pixels."""
 
     path: str
-    """Relative to the report."""
+    """Path relative to the report."""
     width: int
     height: int
 
@@ -192,13 +203,24 @@ FramePictures = tuple[ImageFile, dict[str, ImageFile]]
 def write_pictures(
     rows: Sequence[FrameRow], run: Path, report: Path, final: Viewer | None, threads: int
 ) -> dict[int, FramePictures]:
-    """Write all pictures below ``report``; ``final`` renders the last scene, where there is one."""
+    """Write the thumbnails and layers of all frames.
+
+    Args:
+        rows: The frames.
+        run: The run folder.
+        report: Folder of the report.
+        final: Renderer of the last scene; None without one.
+        threads: Number of threads.
+
+    Returns:
+        frame_id -> image files.
+    """
     (report / FOLDER).mkdir(parents=True)
     placed = [row.frame.frame_id for row in rows if final and row.frame.registered]
-    rendered = set(placed[:: -(-len(placed) // RENDERED) or 1])
+    rendered = set(placed[:: -(-len(placed) // MAX_RENDERED) or 1])
     layers = sum(5 if row.selection else 1 for row in rows) + len(rendered)
-    side = side_of(layers, rows[0].frame.height / rows[0].frame.width if rows else 1.0, BYTES)
-    # Renders come one after the other, since each uses all threads; the files are read and written meanwhile.
+    side = side_of(layers, rows[0].frame.height / rows[0].frame.width if rows else 1.0, IMAGE_BYTES)
+    # Renders run one after the other, since each uses all threads. Files are read and written in parallel.
     with ThreadPoolExecutor(threads) as pool:
         futures = {}
         for row in rows:
@@ -212,16 +234,25 @@ def write_pictures(
 
 
 def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -> int:
-    """The longer side, px, with which so many pictures (height / width: ``aspect``) take ``budget`` bytes.
+    """Return the long side, in pixels, with which all images fit into a limit.
 
-    It is ``least`` where that would be too small to see anything.
+    Args:
+        pictures: Number of images.
+        aspect: Height divided by width.
+        budget: Limit for the total size of the JPEG files, in bytes.
+        least: Minimum of the long side, even if the limit is then exceeded.
     """
     pixels = budget / (_BYTES_PER_PIXEL * max(pictures, 1))
     return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), least, _SIDE_MAX))
 
 
 def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
-    """The frame as filmed, and the other layers of its latest round. Raises InputError, StoreError."""
+    """Return layer -> image [H, W, 3] sRGB: the raw frame, and the other layers of its latest round.
+
+    Raises:
+        InputError: if an image cannot be read.
+        StoreError: if the file of the layers cannot be read.
+    """
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.selection is not None:
         stored = read_exr(run / "rivr" / row.selection.exr).layers
@@ -240,7 +271,14 @@ def _write_frame(row: FrameRow, run: Path, report: Path, final: ImageU8 | None, 
 
 
 def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:
-    """Write ``image`` reduced to at most ``side`` pixels."""
+    """Write a JPEG file whose long side has at most ``side`` pixels.
+
+    Args:
+        report: Folder of the report.
+        name: Path of the file relative to ``report``.
+        image: The image [H, W, 3], sRGB.
+        side: Maximum of the long side, in pixels.
+    """
     height, width = image.shape[:2]
     factor = min(1.0, side / max(height, width))
     if factor < 1.0:

@@ -1,4 +1,4 @@
-"""``RUN/report/index.html``: a run as a page that opens from the disk, without a server or a network."""
+"""``RUN/report/index.html``: the report of a run, a page that needs no server and no network."""
 
 from __future__ import annotations
 
@@ -45,24 +45,30 @@ from cleargs.report.frames import (
 )
 from cleargs.report.report_json import PAGE, LastRun, last_run, linked_manifests, page_of, write_report_json
 from cleargs.report.verdict import ReportVerdict
-from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
+from cleargs.report.web_scene import level_camera, opening_frame, viewer_data, write_scene, write_viewer
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.render import Viewer
 from cleargs.splat.tables import TRAIN
 
-_STILL = 960  # px, long side of the pictures that stand for the viewers
+_STILL = 960  # long side of the images that are shown until the 3D viewers have loaded, px
 
 
 def write_page(folder: Path, template: str | Template, **values: Any) -> None:
-    """Write ``index.html`` into ``folder`` from one of the templates; all text in ``values`` is escaped."""
+    """Write ``index.html`` from a template.
+
+    Args:
+        folder: Folder of the page.
+        template: A template, or the name of one of the report's templates.
+        values: Variables of the template. Their text is escaped.
+    """
     html = page_environment().get_template(template).render(version=cleargs.__version__, **values)
     (folder / PAGE).write_bytes(html.encode())
 
 
 def json_in_html(value: Any) -> Markup:
-    """``value`` as JSON that is inert inside a script element, whatever its strings hold."""
+    """Return ``value`` as JSON without characters that could end its script element."""
     text = json.dumps(plain_json(value), ensure_ascii=True, separators=(",", ":"))
     for letter in "<>&":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
@@ -70,7 +76,7 @@ def json_in_html(value: Any) -> Markup:
 
 
 def page_environment() -> Environment:
-    """Return the templates of the report, with the filters and globals that they use."""
+    """Return the Jinja environment of the report's templates, with their filters and globals."""
     environment = Environment(
         loader=PackageLoader("cleargs.report"),
         autoescape=True,
@@ -86,18 +92,23 @@ def page_environment() -> Environment:
 
 
 def write_report(planner: Planner, last: LastRun | None = None) -> Path:
-    """Write the report of ``planner.run``, in place of an older one; returns its page.
+    """Write the report of a run atomically, in place of an older one.
 
-    Without ``last``, what an older report noted of the last run is kept. The folder appears whole.
+    Args:
+        planner: Planner of the run.
+        last: The work of the last ``cleargs run`` (default: as in the older report).
+
+    Returns:
+        The path of the page.
 
     Raises:
-        InputError: when nothing of the run is done yet.
-        StoreError: when a result cannot be read, or the report not be written.
+        InputError: if no stage of the run is finished.
+        StoreError: if a result cannot be read, or if the report cannot be written.
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
-        raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs status {run}")
+        raise InputError(f"no stage of {run} is finished", hint=f"see cleargs status {run}")
     last = last or last_run(run)
     set_threads(planner.threads)
     rows = load_rows(run, manifests)
@@ -106,8 +117,8 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     plans: dict[str, StagePlan] = {}
     try:
         plans = {plan.stage: plan for plan in planner.plan()}
-    except InputError as error:  # the capture has gone
-        planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
+    except InputError as error:  # the capture was deleted or moved
+        planner.reporter.warn(f"the report cannot say if the results are up to date: {error}")
     versions: dict[str, str] = {}
     for manifest in manifests.values():
         versions |= {**manifest.versions, **manifest.parts.libraries}
@@ -124,7 +135,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             verdict=ReportVerdict(manifests, rows, planner.run.config),
             scenes=scenes,
             viewer=write_viewer(folder) if scenes else "",
-            plan=plan_of(rows),
+            camera_map=camera_map(rows),
             curves=training_curves(run, trained),
             bars=fitted_bars(rows),
             stages=planner.dag.names,
@@ -154,15 +165,16 @@ def _scenes(
 ) -> tuple[list[dict[str, Any]], Viewer]:
     """Write the first and the last scene, each with a still.
 
-    Returns the words of the page on them, and the renderer of the last.
+    Returns:
+        The data of both scenes for the template, and a renderer of the last scene.
     """
-    camera = camera_of(opening(placed).frame)
+    camera = camera_of(opening_frame(placed).frame)
     factor = _STILL / max(camera.width, camera.height)
     still = level_camera(camera, *(max(1, round(factor * side)) for side in (camera.width, camera.height)))
     views: list[dict[str, Any]] = []
     for key, stage, what in (
-        ("before", trained[0], "trained on the frames as filmed"),
-        ("after", trained[-1], "trained on, repairs included"),
+        ("before", trained[0], "trained on the raw frames"),
+        ("after", trained[-1], "trained further, with repairs"),
     ):
         file = run / stage / "scene.ply"
         unchanged = views and filecmp.cmp(file, run / trained[0] / "scene.ply", shallow=False)
@@ -172,7 +184,7 @@ def _scenes(
             {
                 "key": key,
                 "title": key.capitalize(),
-                "what": "the same scene: no repair changed it" if unchanged else what,
+                "what": "the same scene, since no repair changed it" if unchanged else what,
                 "stage": stage,
                 "gaussians": scene.gaussians.num,
                 "still": write_jpeg(folder, f"{key}.jpg", renderer.view(still), _STILL),
@@ -186,7 +198,7 @@ def _scenes(
 
 
 def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
-    """Name, value, default and meaning of each setting of the stages that differs from its default."""
+    """Return name, value, default and meaning of each setting that differs from its default."""
     return [
         (setting.name, _toml(value), _toml(setting.default), setting.meaning)
         for setting, value in config.settings()
@@ -195,12 +207,12 @@ def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
 
 
 def command(run: RunSpec, dag: Dag) -> str:
-    """The ``cleargs run`` that makes this run, called next to its folder: a recipe, then settings."""
-    wanted = dict(flattened(run.config.document()))
+    """Return the ``cleargs run`` command that reproduces a run, to be called next to its folder."""
+    settings = dict(flattened(run.config.document()))
     candidates = []
     for recipe in ("default", *(name for name in recipe_names() if name != "default")):
-        have = dict(flattened(load_config(dag, recipe).document()))
-        changed = {name: value for name, value in wanted.items() if have.get(name) != value}
+        from_recipe = dict(flattened(load_config(dag, recipe).document()))
+        changed = {name: value for name, value in settings.items() if from_recipe.get(name) != value}
         candidates.append((len(changed), recipe, changed))
     _, recipe, changed = min(candidates, key=lambda item: item[0])
     source = os.path.relpath(run.source, run.folder.parent)
@@ -213,22 +225,22 @@ def command(run: RunSpec, dag: Dag) -> str:
 
 
 def _toml(value: Any) -> str:
-    """``value`` as TOML writes it; "unset" for None."""
+    """Return ``value`` in TOML, or "unset" for None."""
     if value is None:
         return "unset"
     return " ".join(tomli_w.dumps({"v": value}).removeprefix("v = ").split())
 
 
 def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | None) -> dict[str, Any]:
-    """All that the page says of a frame."""
+    """Return the data of a frame for the page; ``time`` is its time in the viewer's animation, in seconds."""
     lacking = {f"low {name}": row.judged.get(f"r_{name}") for name in R_CUES}
     cues = {name: 1.0 - value for name, value in lacking.items() if value is not None}
     harms = {name.replace("_", " "): row.judged.get(f"b_{name}") for name in B_CUES}
     cues |= {name: value for name, value in harms.items() if value is not None}
     repair, why, scores = "none tried", "", {}
     if row.selection:
-        words = CHOICES[row.selection.chosen]
-        repair = words if row.chosen else f"none: {words} was refused"
+        choice = CHOICES[row.selection.chosen]
+        repair = choice if row.chosen else f"none: {choice} was refused"
         scores = dict(scores_of(row.selection))
         metric, deciding = scores_of(row.selection)[0]
         found = ", ".join(f"{name} {score:.1f}" for name, score in deciding.items())
@@ -240,7 +252,7 @@ def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | No
         "role": row.role,
         "weight": row.weight,
         "figures": {name: row.judged[name] for name in "RBGCDOZ" if row.judged.get(name) is not None},
-        "cues": dict(sorted(cues.items(), key=lambda item: -item[1])),  # how bad, the worst first
+        "cues": dict(sorted(cues.items(), key=lambda item: -item[1])),  # the worst first
         "repair": repair,
         "why": why,
         "chosen": row.selection.chosen if row.selection and row.selection.accepted else None,
@@ -256,20 +268,21 @@ def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | No
     }
 
 
-# -- drawings: SVG paths of curves, and cameras seen from above ----------------------------------------------
+# -- drawings: SVG paths of curves, and a map of the cameras -------------------------------------------------
 
 
 WIDTH, HEIGHT = 640, 220
-"""Of a curve's drawing area, in units of its SVG."""
+"""Size of a curve's drawing area, in SVG units."""
 
-_POINTS = 120  # of a curve
+_POINTS = 120  # maximum number per curve
 _LOW, _HIGH = np.array([222.0, 135.0, 38.0]), np.array([22.0, 146.0, 138.0])  # amber, teal
 
 
 def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
-    """Loss and PSNR on real frames, and Gaussians, over the steps of these stages. Raises StoreError.
+    """Return the curves of loss, PSNR and number of Gaussians over the training steps.
 
-    Places (of ticks, and of the parts where each training starts) are in `WIDTH` x `HEIGHT`.
+    Loss and PSNR are those of raw frames. Positions of ticks, and of the starts of the trainings (``parts``),
+    are in the units of `WIDTH` and `HEIGHT`. Raises StoreError if a table cannot be read.
     """
     paths = {stage: run / stage / "train.parquet" for stage in stages}
     tables = {stage: read_table(path, TRAIN) for stage, path in paths.items() if path.is_file()}
@@ -284,10 +297,10 @@ def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
     def curve(title: str, unit: str, name: str, digits: int, *, only_real: bool) -> dict[str, Any]:
         values = steps[name].to_numpy().astype(np.float64)
         known = np.flatnonzero(real & np.isfinite(values)) if only_real else np.arange(len(values))
-        # Medians of equal stretches: a step shows one view, and views differ more than steps do.
-        stretches = np.array_split(known, min(_POINTS, max(1, len(known) // 6)))
-        x = np.array([part.mean() for part in stretches]) / max(len(values) - 1, 1) * WIDTH
-        y = np.array([np.median(values[part]) for part in stretches])
+        # Medians over equal intervals: each step shows one view, and views differ more than steps.
+        intervals = np.array_split(known, min(_POINTS, max(1, len(known) // 6)))
+        x = np.array([part.mean() for part in intervals]) / max(len(values) - 1, 1) * WIDTH
+        y = np.array([np.median(values[part]) for part in intervals])
         ticks = MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)).tick_values(float(y.min()), float(y.max()))
         down = np.interp(y, (ticks[0], ticks[-1]), (HEIGHT, 0.0))
         return {
@@ -302,29 +315,31 @@ def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
         }
 
     return [
-        curve("PSNR of the frames trained on", "dB", "psnr", 1, only_real=True),
+        curve("PSNR on training frames", "dB", "psnr", 1, only_real=True),
         curve("Loss", "", "loss", 3, only_real=True),
         curve("Gaussians", "", "n_gaussians", 0, only_real=False),
     ]
 
 
 def weight_colour(weight: float) -> str:
-    """Amber (barely used) to teal (fully), which people with any colour vision can tell apart."""
+    """Return a colour from amber (weight 0) to teal (weight 1), which works for any colour vision."""
     red, green, blue = np.rint(_LOW + (_HIGH - _LOW) * min(max(weight, 0.0), 1.0)).astype(int)
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 
-def plan_of(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
-    """The cameras of the placed frames from above (x to the right, z up), in units of the SVG; None without
-    any. The tip of a mark ends the line that shows where it looks.
+def camera_map(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
+    """Return a map of the placed frames from above, with x to the right and z upwards, in SVG units.
+
+    The ``tip`` of a mark is the end of a line in the viewing direction. The result is None without placed
+    frames.
     """
     placed = [row for row in rows if row.frame.registered]
     if not placed:
         return None
     cameras = [camera_of(row.frame) for row in placed]
     centres = np.array([camera.centre[[0, 2]] for camera in cameras]) * [1.0, -1.0]
-    looks = np.array([camera.world_to_camera[2, [0, 2]] for camera in cameras]) * [1.0, -1.0]
-    looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+    directions = np.array([camera.world_to_camera[2, [0, 2]] for camera in cameras]) * [1.0, -1.0]
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     low, high = centres.min(axis=0), centres.max(axis=0)
     scale = 520.0 / max(float((high - low).max()), 1e-6)
     size = (high - low) * scale
@@ -341,14 +356,14 @@ def plan_of(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
             "tip": (round(float(x + 26 * dx), 1), round(float(y + 26 * dy), 1)),
             "active": bool(row.weight),
         }
-        for row, (x, y), (dx, dy) in zip(placed, at, looks, strict=True)
+        for row, (x, y), (dx, dy) in zip(placed, at, directions, strict=True)
     ]
     path = "M" + " L".join(f"{mark['x']},{mark['y']}" for mark in marks)
     return {"width": float(size[0]) + 120.0, "height": height + 120.0, "path": path, "marks": marks}
 
 
 def fitted_bars(rows: Sequence[FrameRow]) -> list[dict[str, Any]]:
-    """The figures of each frame's exposure, as far as they are known: frame id and value of each bar."""
+    """Return bar charts of the fitted camera effects, with pairs of frame_id and value as ``known``."""
     bars = []
     for title, unit, found in (
         ("Motion blur", "px", [row.motion("blur_px") for row in rows]),

@@ -1,4 +1,4 @@
-"""What a report was made from, and what the last run did: ``report.json`` beside the page."""
+"""``report.json``, next to the page: the results that the report shows, and the work of the last run."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ FOLDER, PAGE, REPORT_JSON = "report", "index.html", "report.json"
 
 @dataclass(frozen=True)
 class LastRun:
-    """What the last ``cleargs run`` did, which no manifest says."""
+    """The work of the last ``cleargs run``, which manifests do not record."""
 
     stages: Mapping[str, str]
-    """Stage -> made or found."""
+    """Stage -> "made" if it ran, "found" if its results were up to date."""
     peak_memory_gb: float
 
 
 def page_of(run: Path) -> Path:
-    """Where the report of ``run`` is, or would be."""
+    """Return the path of the report of ``run``, which need not exist."""
     return run / FOLDER / PAGE
 
 
 def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
-    """The manifests that the run shows now, in the order of the stages."""
+    """Return stage -> manifest for the results in the run folder, in the order of ``names``."""
     found = {name: linked_manifest(run, name) for name in names}
     return {name: manifest for name, manifest in found.items() if manifest is not None}
 
 
 def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
-    """Whether the report of ``run`` is of these results and of this version."""
+    """Return True if the report of ``run`` shows the results of ``manifests`` and has this version."""
     return (run / FOLDER / PAGE).is_file() and _read_report(run).get("made_from") == _made_from(manifests)
 
 
@@ -46,14 +46,14 @@ def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
 
 def _read_report(run: Path) -> dict[str, Any]:
     try:
-        record = read_json(run / FOLDER / REPORT_JSON)
+        content = read_json(run / FOLDER / REPORT_JSON)
     except (OSError, ValueError):
         return {}
-    return record if isinstance(record, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def last_run(run: Path) -> LastRun | None:
-    """What the present report knows of the last run; None without it."""
+    """Return the last run as recorded in the present report; None without it."""
     try:
         return LastRun(**_read_report(run)["last_run"])
     except (KeyError, TypeError):
@@ -61,6 +61,6 @@ def last_run(run: Path) -> LastRun | None:
 
 
 def write_report_json(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
-    """Note in the report's ``folder`` what it is made from."""
-    note = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
-    write_json(folder / REPORT_JSON, note)
+    """Write ``report.json`` into the ``folder`` of a report."""
+    content = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
+    write_json(folder / REPORT_JSON, content)

@@ -1,7 +1,7 @@
-"""The server of ``cleargs watch``: the report of one run, and its progress, for readers on this machine.
+"""The server of ``cleargs watch``, which shows the report of one run and its progress.
 
-It changes nothing, and serves no file outside the report but the latest preview. A page of another site may
-make a browser ask a server on this machine under a foreign name (DNS rebinding): that name is refused.
+It is read-only, and serves only the files of the report and the latest preview. A page of another site may
+make a browser request this server under a foreign name (DNS rebinding), so the server refuses other names.
 """
 
 from __future__ import annotations
@@ -32,9 +32,16 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'"
 
 
 class Server(ThreadingHTTPServer):
-    """Serves ``run`` at ``host`` (a name or an address) and ``port`` (0: one that is free).
+    """The HTTP server of a run.
 
-    Raises InputError when the address is not available.
+    Args:
+        dag: The stages.
+        run: The run.
+        host: Name or IP address to listen at.
+        port: Port to listen at (0: any free port).
+
+    Raises:
+        InputError: if the address is not available.
     """
 
     daemon_threads = True
@@ -46,18 +53,18 @@ class Server(ThreadingHTTPServer):
         except OSError as error:
             raise InputError(
                 f"cannot serve at {host}:{port}: {error.strerror or error}",
-                hint="choose another --port (0: one that is free), and a --host of this machine",
+                hint="choose another --port (0: any free port), or a --host of this machine",
             ) from error
 
     @property
     def address(self) -> str:
-        """The URL for a browser on this machine."""
+        """URL for a browser on this machine."""
         host, port = self.server_address[:2]
         name = f"[{host!s}]" if ":" in str(host) else str(host)
         return f"http://{name}:{port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print one line for a failure; a reader that went away is no failure."""
+        """Print one line for a failure. A closed connection does not count as one."""
         error = sys.exception()
         if not isinstance(error, ConnectionError | TimeoutError):
             print(f"warning: a request failed: {error!r}", file=sys.stderr)
@@ -74,11 +81,11 @@ class _Handler(SimpleHTTPRequestHandler):
         super().__init__(*arguments, directory=str(run.folder))
 
     def send_head(self) -> BytesIO | BinaryIO | None:
-        """Send the headers; returns the body."""
+        """Send the headers, and return the body."""
         path = urlsplit(self.path).path
         if not self._has_own_name():
-            self.send_error(HTTPStatus.FORBIDDEN, explain="This server answers to its own address only.")
-        elif path == "/favicon.ico":  # every browser asks for it
+            self.send_error(HTTPStatus.FORBIDDEN, explain="This server answers only to its own address.")
+        elif path == "/favicon.ico":  # every browser requests it
             self.send_response(HTTPStatus.NO_CONTENT)
             self.end_headers()
         elif path == "/" and self._state()["done"]:
@@ -98,27 +105,27 @@ class _Handler(SimpleHTTPRequestHandler):
         return None
 
     def translate_path(self, path: str) -> str:
-        """The file for a URL; "" where it is not one of ours."""
-        place = urlsplit(path).path
-        if place in _PAGES:
-            return str(Path(__file__).parent / "static" / _PAGES[place])
-        if place == "/preview.png":
+        """Return the file for a URL; "" if it is not served."""
+        url_path = urlsplit(path).path
+        if url_path in _PAGES:
+            return str(Path(__file__).parent / "static" / _PAGES[url_path])
+        if url_path == "/preview.png":
             work = running_stage(self._run.folder, self._run.store)
             preview = None if work is None else preview_of(work, self._run.store)
             return "" if preview is None else str(preview.path)
         report = self._run.folder.resolve() / FOLDER
-        with suppress(OSError, ValueError, RuntimeError):  # a zero byte, a name too long, a loop of links
+        with suppress(OSError, ValueError, RuntimeError):  # a zero byte, a long name, a loop of links
             file = Path(super().translate_path(path)).resolve()
             if file == report or (file.is_relative_to(report) and file.is_file()):
                 return str(file)
         return ""
 
     def list_directory(self, path: Any) -> None:
-        """Answer for a report without its page."""
+        """Send an error instead of a listing, for a report without its page."""
         self.send_error(HTTPStatus.NOT_FOUND)
 
     def end_headers(self) -> None:
-        if urlsplit(self.path).path in _PAGES:  # the report has a policy of its own, in its page
+        if urlsplit(self.path).path in _PAGES:  # the page of the report contains its policy
             self.send_header("Content-Security-Policy", _POLICY)
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
@@ -129,7 +136,7 @@ class _Handler(SimpleHTTPRequestHandler):
         """Log nothing."""
 
     def _has_own_name(self) -> bool:
-        """True for a request to an IP address, which no other site can have as its name, or to our name."""
+        """Return True for a request to our name, or to an IP address, which no other site has as its name."""
         try:
             name = urlsplit(f"//{self.headers['Host']}").hostname or ""
             return name in ("localhost", self._host.lower()) or ip_address(name) is not None
@@ -137,15 +144,15 @@ class _Handler(SimpleHTTPRequestHandler):
             return False
 
     def _state(self) -> dict[str, Any]:
-        """All that the live page shows, as JSON values."""
+        """Return the data of the live page as JSON values."""
         run = self._run
         work = running_stage(run.folder, run.store)
         manifests = linked_manifests(run.folder, self._dag.names)
         preview = None if work is None else preview_of(work, run.store)
         stages = []
         for name in self._dag.names:
-            working = work is not None and work.stage == name
-            state = "at work" if working else "done" if name in manifests else "to do"
+            running = work is not None and work.stage == name
+            state = "running" if running else "done" if name in manifests else "to do"
             seconds = manifests[name].seconds if state == "done" else None
             stages.append({"name": name, "state": state, "seconds": seconds})
         return {

@@ -1,8 +1,8 @@
-"""How a run went, in words, and what stands in the way of a better one, each with the setting to change.
+"""The verdict of a report: the quality of the result in words, and settings that may improve it.
 
-None of the thresholds here is calibrated. They are round numbers, chosen by judgement: no set of captures of
-which people had said how good their scenes are was held against them. The figures behind the verdict are of
-training poses, so it says how well a scene explains what was filmed, and not how new views look.
+The thresholds are round numbers, chosen by judgement. They are not calibrated by people's ratings of scenes.
+The figures behind the verdict are for training poses: they measure how well a scene matches the video, not
+the quality of new views.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow, last_scene
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
-"""Training PSNR from which a scene is said to follow its frames closely, and below which only loosely. What
-a number means depends on the noise and the texture of the capture."""
+"""PSNR on training frames from which the match is close, and below which it is loose. The PSNR of a good
+scene depends on the noise and the texture of the capture."""
 FEW_PLACED = 0.8
-"""Share of frames with a pose, below which the others are cautioned about."""
+"""Share of frames with a pose, below which the page has a caution."""
 MANY_UNUSED = 0.4
-"""Share of placed frames with weight 0, above which they are cautioned about."""
-SOFT_PX = 6.0
-"""Motion while exposed, px, above which a frame counts as blurred."""
+"""Share of placed frames with weight 0, above which the page has a caution."""
+BLURRED_PX = 6.0
+"""Motion blur above which a frame counts as blurred, px."""
 
 Tone = Literal["good", "fair", "poor"]
 
@@ -34,23 +34,29 @@ class Caution(NamedTuple):
     what: str
     why: str
     settings: tuple[str, ...] = ()
-    """As ``--set`` takes them; empty where no setting helps."""
+    """Arguments of ``--set``; empty if no setting helps."""
 
 
 class ReportVerdict:
-    """The first screen of a report of a run that shows these ``manifests``."""
+    """The texts and figures on the first screen of a report.
+
+    Args:
+        manifests: Stage -> manifest of the results that the report shows.
+        rows: The frames.
+        config: Settings of the run.
+    """
 
     def __init__(self, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> None:
         self._manifests, self._rows, self._config = manifests, rows, config
         self._placed = [row for row in rows if row.frame.registered]
         self._unused = sum(row.weight == 0.0 for row in self._placed)
-        # PSNR of the first scene on the best frames of its training, dB, and the name of these frames.
-        self._psnr, self._judged_on = self._figure("g0", "psnr_strong"), "the trusted training frames"
+        # PSNR in dB of the first scene on the best training frames, and a description of these frames.
+        self._psnr, self._compared = self._figure("g0", "psnr_strong"), "the best training frames"
         if self._psnr is None:
-            self._psnr, self._judged_on = self._figure("g0", "psnr_active"), "its training frames"
+            self._psnr, self._compared = self._figure("g0", "psnr_active"), "the training frames"
 
     def _figure(self, stage: str, *path: str) -> Any:
-        """A figure that a stage reported; None without the stage or the figure."""
+        """Return a figure from the summary of a stage; None without the stage or the figure."""
         value: Any = self._manifests[stage].summary if stage in self._manifests else None
         for name in path:
             value = value.get(name) if isinstance(value, Mapping) else None
@@ -60,81 +66,79 @@ class ReportVerdict:
         return getattr(self._config.sections[section], name)
 
     def headline(self) -> tuple[Tone, str]:
-        """The tone and the first line."""
+        """Return the tone and the first line."""
         if "g0" not in self._manifests:
-            return "fair", "The capture is prepared; no scene is trained yet."
+            return "fair", "The capture is prepared. No scene is trained yet."
         if self._psnr is None:
             return "fair", "The scene is trained."
-        follows = f"The first scene follows {self._judged_on}"
+        matches = f"the first scene matches {self._compared}"
         if self._psnr >= CLOSE_DB:
-            return "good", f"{follows} closely."
+            return "good", f"Good: {matches} closely."
         if self._psnr >= LOOSE_DB:
-            return "fair", f"{follows} fairly closely."
-        return "poor", f"{follows} only loosely."
+            return "fair", f"Fair: {matches} reasonably well."
+        return "poor", f"Poor: {matches} only loosely."
 
     def text(self) -> str:
-        """The lines under the headline."""
-        parts = [f"{len(self._placed)} of {count(len(self._rows), 'frame')} found their place in the scene"]
+        """Return the text below the headline."""
+        parts = [f"ClearGS placed {len(self._placed)} of {count(len(self._rows), 'frame')} in the scene"]
         if strong := sum(row.role == "strong" for row in self._rows):
-            parts[0] += f", {strong} of them sharp and reliable enough to lead the training"
+            parts[0] += f", {strong} of them sharp and reliable (role strong)"
         if self._unused:
-            parts.append(f"{count(self._unused, 'frame')} took no part in it")
-        parts.append(self._harm())
+            parts.append(f"training did not use {count(self._unused, 'placed frame')}")
+        parts.append(self._effect_of_repairs())
         return " ".join(f"{part[0].upper()}{part[1:]}." for part in parts if part)
 
-    def _harm(self) -> str:
-        """The effect of the repairs on frames that no repair was trained on; "" where it is unknown."""
+    def _effect_of_repairs(self) -> str:
+        """Return a sentence on the frames that were not repaired (the judges); "" if it is unknown."""
         stage = "consolidate" if "consolidate" in self._manifests else "rivr"
         before, after = (self._figure(stage, "held_back", f"psnr_{when}") for when in ("before", "after"))
         if before is None or after is None:
             return ""
         if self._figure(stage, "published") == "G0":
-            return "the repairs did not pay off, so the first scene is also the last"
+            return "the repairs did not improve the scene, so the first scene is the final scene"
         none = self._figure("consolidate", "repairs") == 0
-        lead = "no frame needed a repair; trained on" if none else "after the repairs"
+        lead = "no frame needed a repair. With further training" if none else "with the repairs"
         return (
-            f"{lead}, the scene explains training frames that were kept aside from repairs "
-            f"{abs(after - before):.1f} dB {'more' if after >= before else 'less'} exactly "
-            f"({before:.1f} dB before, {after:.1f} dB now)"
+            f"{lead}, PSNR on reliable frames that were not repaired "
+            f"{'rose' if after >= before else 'fell'} from {before:.1f} dB to {after:.1f} dB"
         )
 
     def figures(self) -> Iterator[tuple[str, str, str]]:
-        """The numbers of the first screen, each with its label and a note."""
+        """Yield the numbers of the first screen, each as (number, label, note)."""
         placed = f"{len(self._placed)} of {len(self._rows)}"
-        yield placed, "frames placed", "with a pose that fits the others"
+        yield placed, "frames placed", "with a known camera pose"
         if "rva" in self._manifests:
             active = sum(bool(row.weight) for row in self._rows)
-            whole = f"as much as {self._figure('rva', 'effective_frames'):.1f} whole ones together"
-            yield str(active), "frames train the scene", whole
+            effective = f"{self._figure('rva', 'effective_frames'):.1f}"
+            yield str(active), "frames used in training", f"equivalent to {effective} equally weighted frames"
         if self._psnr is not None:
-            rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
-            note = f"PSNR of the first scene on training poses; {rule}"
-            yield f"{self._psnr:.1f} dB", f"on {self._judged_on}", note
+            rule = f"rule of thumb: close from {CLOSE_DB:g} dB, loose below {LOOSE_DB:g} dB"
+            yield f"{self._psnr:.1f} dB", f"PSNR on {self._compared}", f"first scene; {rule}"
         unseen = self._figure(last_scene(self._manifests) or "", "psnr_unseen")
         if unseen is not None:
-            note = "PSNR of the last scene on a hundredth of every frame; views off the path are worse"
-            yield f"{unseen:.1f} dB", "on pixels that no training saw", note
+            note = "last scene, 1 % of each frame; views away from the camera path are worse"
+            yield f"{unseen:.1f} dB", "PSNR on pixels that no training used", note
         repairs = self._figure("consolidate", "repairs")
         if repairs is not None:
             views = "repaired views" if repairs != 1 else "repaired view"
-            yield str(repairs), views, "carried into the final scene"
+            yield str(repairs), views, "used for the final scene"
 
     def warnings(self) -> Iterator[Caution]:
-        """All cautions, in the order of the stages."""
+        """Yield all cautions, in the order of the stages."""
         for manifest in self._manifests.values():
             for missing in manifest.missing:
-                yield Caution(f"{manifest.stage} is done only in part", missing)
-        yield from self._of_capture()
-        yield from self._of_allocation()
+                yield Caution(f"{manifest.stage} is incomplete", missing)
+        yield from self._capture_cautions()
+        yield from self._allocation_cautions()
         if "g0" in self._manifests:
-            yield from self._of_scenes()
+            yield from self._scene_cautions()
 
-    def _of_capture(self) -> Iterator[Caution]:
-        """The faults of the frames and their poses."""
+    def _capture_cautions(self) -> Iterator[Caution]:
+        """Yield cautions about the frames and their poses."""
         rows = self._rows
         unplaced = sum(row.role == UNPLACED for row in rows)
         available = self._figure("ingest", "frames_available") or 0
-        more: tuple[str, ...] = ()  # the setting that limits the frames of a capture, where there are more
+        more: tuple[str, ...] = ()  # the setting that limits the number of frames, if the capture has more
         if available > len(rows):
             fps = self._setting("ingest", "fps")
             if fps is not None and len(rows) < self._setting("ingest", "max_frames"):
@@ -145,64 +149,65 @@ class ReportVerdict:
             all_pairs = len(rows) < self._setting("ingest", "exhaustive_below")
             overlap = () if all_pairs else (f"ingest.overlap={2 * self._setting('ingest', 'overlap')}",)
             yield Caution(
-                f"{count(unplaced, 'frame')} found no place",
-                "They share too few points with their neighbours: too blurred, or too far apart.",
+                f"{count(unplaced, 'frame has', 'frames have')} no pose",
+                "They share too few points with their neighbours: they are too blurred or too far apart.",
                 more + overlap,
             )
         if available > 1.5 * len(rows):
-            why = "More frames bring more views of every surface, at more time."
+            why = "More frames show each surface from more views, but take more time."
             yield Caution(f"{len(rows)} of {available} frames were used", why, more)
         if rows and not any(row.role == HELD_OUT for row in rows):
-            why = "All figures here are of frames that the scene has seen; new views may look worse."
+            why = "All figures here are for frames that the scene was trained on. New views may look worse."
             yield Caution("No frame was held out", why, ("ingest.holdout=every:8",))
 
-    def _of_allocation(self) -> Iterator[Caution]:
-        """The faults that RVA found."""
+    def _allocation_cautions(self) -> Iterator[Caution]:
+        """Yield cautions about the weights of the frames."""
         lower = f"rva.tau_R={max(self._setting('rva', 'tau_R') - 0.1, 0.0):.2f}"
         if self._figure("rva", "stand_in"):
             yield Caution(
                 "No frame counts as reliable",
-                "The best of them are used instead. Thresholds nearer to this capture would separate good "
-                "frames from bad ones.",
+                "The best frames are used instead. Thresholds closer to the scores of this capture would "
+                "separate good frames from bad frames.",
                 (lower, f"rva.tau_B={min(self._setting('rva', 'tau_B') + 0.1, 1.0):.2f}"),
             )
         if uncovered := self._figure("rva", "bins_uncovered_before"):
             yield Caution(
                 f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame",
-                "Weak frames were taken back there, at low weight, and the scene is softer. "
-                "Film slower there.",
+                "Weak frames are used there at low weight, so the scene is softer. Film more slowly there.",
             )
         weighted = sum(row.weight is not None for row in self._placed)
         if weighted and self._unused > MANY_UNUSED * weighted:
-            why = "A lower threshold of reliability lets more of them in."
-            yield Caution(f"{self._unused} of {weighted} placed frames are unused", why, (lower,))
-        blurred = sum((row.motion("blur_px") or 0.0) > SOFT_PX for row in self._rows)
+            why = "A lower reliability threshold would use more of them."
+            yield Caution(f"{self._unused} of {weighted} placed frames are not used", why, (lower,))
+        blurred = sum((row.motion("blur_px") or 0.0) > BLURRED_PX for row in self._rows)
         if blurred > len(self._rows) / 2:
-            what = f"{count(blurred, 'frame')} moved by more than {SOFT_PX:g} px while exposed"
-            yield Caution(what, "A shorter exposure or a slower hand gives sharper frames than any repair.")
+            what = f"{count(blurred, 'frame has', 'frames have')} more than {BLURRED_PX:g} px of motion blur"
+            yield Caution(
+                what, "Shorter exposure or slower camera motion gives sharper frames than any repair."
+            )
 
-    def _of_scenes(self) -> Iterator[Caution]:
-        """The faults that the trainings found."""
+    def _scene_cautions(self) -> Iterator[Caution]:
+        """Yield cautions about the trainings."""
         psnr = self._figure("g0", "psnr_strong")
         if psnr is not None and psnr < CLOSE_DB:
             size = self._setting("ingest", "max_size") * 3 // 2
             yield Caution(
-                f"The first scene reaches {psnr:.1f} dB on the frames it trusts",
-                "A longer training, or larger images, bring out finer detail.",
+                f"The first scene reaches only {psnr:.1f} dB on the best training frames",
+                "A longer training or larger images give finer detail.",
                 (f"g0.steps={2 * self._figure('g0', 'steps')}", f"ingest.max_size={size}"),
             )
         spread = self._figure("g0", "exposure_spread") or 0.0
         if spread > self._setting("g0", "exposure_threshold") and not self._figure("g0", "exposure"):
             yield Caution(
                 f"Exposure differs by {100 * spread:.0f} % between frames",
-                "Without compensation the scene takes on their average, with floating haze.",
+                "Without compensation the scene averages the exposures, which causes floating haze.",
                 ("g0.exposure=auto",),
             )
         for stage in ("rivr", "consolidate"):
             if harm := self._figure(stage, "held_back", "harm"):
                 yield Caution(
                     f"The scene of {stage} was rejected",
-                    f"It explains frames kept aside worse than before ({harm}), so the one before it stays.",
+                    f"It matches frames without repairs worse than the scene before ({harm}), which is kept.",
                     ("rivr.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
                 )
         rounds = self._figure("rivr", "rounds") or []
@@ -211,7 +216,7 @@ class ReportVerdict:
         if made and 2 * refused > made:
             yield Caution(
                 f"{refused} of {made} repairs were refused",
-                "They agree with neither the frame nor the render: the repair model does not suit this "
-                "capture. `cleargs models list` names others.",
+                "They agree neither with the frame nor with the render: the repair model does not suit this "
+                "capture. `cleargs models list` shows other models.",
                 ("rivr.expert=NAME",),
             )

@@ -1,7 +1,7 @@
-"""The scenes of a report: packed for the browser, the poses its viewers know, and a still in their place.
+"""The scenes of a report: compressed for the browser, with camera poses for the 3D viewers.
 
-The viewer is PlayCanvas's. It turns every PLY by 180 degrees about z, so that our y down becomes its y up;
-poses are turned alike. Its cameras have no roll: a still that stands for a viewer is that of `level_camera`.
+The viewer is PlayCanvas's SuperSplat Viewer. It rotates each PLY by 180 degrees about z, so that y points up.
+Poses are rotated too. Its cameras have no roll, so stills use `level_camera`.
 """
 
 from __future__ import annotations
@@ -23,42 +23,48 @@ from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
-BYTES = 10_000_000
-"""Most that a scene of up to half a million Gaussians may take; SH degrees that do not fit are left out."""
+SCENE_BYTES = 10_000_000
+"""Maximum size of a scene with up to half a million Gaussians. SH degrees that do not fit are left out."""
 
 _VIEWER = Path(__file__).parent / "static" / "viewer"
-_TURN = np.array([-1.0, -1.0, 1.0])
-_SECONDS_PER_FRAME = 0.4  # of the flight along the trajectory
+_ROTATION = np.array([-1.0, -1.0, 1.0])  # the diagonal of the rotation by 180 degrees about z
+_SECONDS_PER_FRAME = 0.4  # in the animation along the trajectory
 _INVISIBLE = 0.5 / 255.0  # opacities below this are stored as 0
-_BASE64, _GZIP = 4 / 3, 0.9  # at worst, of what was measured on trained scenes
+_BASE64, _GZIP = 4 / 3, 0.9  # size ratios; that of gzip is the worst of the trained scenes measured
 
 
 def shown_degree(gaussians: int, sh_degree: int) -> int:
-    """The largest SH degree up to ``sh_degree`` with which so many Gaussians stay below `BYTES`."""
+    """Return the largest SH degree, at most ``sh_degree``, with which the scene stays below `SCENE_BYTES`."""
     for coefficients, degree in sorted(SH_DEGREES.items(), reverse=True):
         size = gaussians * (16 + 3 * (coefficients - 1)) * _BASE64 * _GZIP
-        if degree <= sh_degree and size <= BYTES:
+        if degree <= sh_degree and size <= SCENE_BYTES:
             return degree
     return 0
 
 
 def write_scene(path: Path, name: str, scene: Scene) -> int:
-    """Write ``scene`` as a script that gives it to the page under ``name``; returns the SH degree kept.
+    """Write a scene as a script, since a page that is opened from disk may load scripts but not other files.
 
-    A page from a disk may load scripts, but not read files.
+    Args:
+        path: The script file.
+        name: Name of the scene in the page.
+        scene: The scene.
+
+    Returns:
+        The SH degree that was kept.
     """
     gaussians = scene.gaussians
     visible = torch.sigmoid(gaussians.logit_opacities) >= _INVISIBLE
     degree = shown_degree(int(visible.sum()), gaussians.sh_degree)
-    kept = gaussians.select(visible)
-    kept = Gaussians(**{**kept.tensors(), "sh": kept.sh[:, : (degree + 1) ** 2].contiguous()})
-    packed = gzip.compress(compressed_ply(Scene(kept)), 6, mtime=0)
+    shown = gaussians.select(visible)
+    shown = Gaussians(**{**shown.tensors(), "sh": shown.sh[:, : (degree + 1) ** 2].contiguous()})
+    packed = gzip.compress(compressed_ply(Scene(shown)), 6, mtime=0)
     path.write_bytes(_script(name, packed))
     return degree
 
 
 def write_viewer(folder: Path) -> str:
-    """Write the vendored viewer as a script, with its licence; returns its name and version."""
+    """Write the vendored viewer as a script, with its licence, and return its name and version."""
     (folder / "viewer.js").write_bytes(_script("viewer", (_VIEWER / "index.js.gz").read_bytes()))
     (folder / "viewer-LICENSE.txt").write_bytes((_VIEWER / "LICENSE").read_bytes())
     return (_VIEWER / "VERSION").read_text(encoding="utf-8").strip()
@@ -69,18 +75,24 @@ def _script(name: str, packed: bytes) -> bytes:
 
 
 def viewer_pose(camera: Camera) -> dict[str, Any]:
-    """``camera`` as the viewer takes it: position, target, field of view of the longer side in degrees."""
+    """Return ``camera`` for the viewer: position, target, and field of view of the longer side in degrees."""
     forward = camera.world_to_camera[2, :3]
     side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
     return {
-        "position": (camera.centre * _TURN).tolist(),
-        "target": ((camera.centre + forward) * _TURN).tolist(),
+        "position": (camera.centre * _ROTATION).tolist(),
+        "target": ((camera.centre + forward) * _ROTATION).tolist(),
         "fov": float(np.degrees(2.0 * np.arctan(0.5 * side / focal))),
     }
 
 
 def level_camera(camera: Camera, width: int, height: int) -> Camera:
-    """What the viewer shows at `viewer_pose` in a canvas of this size: no roll, the axis in the middle."""
+    """Return the camera of the viewer at `viewer_pose`: without roll, and with a centred optical axis.
+
+    Args:
+        camera: The camera of a frame.
+        width: Width of the viewer's canvas, in pixels.
+        height: Height of the viewer's canvas, in pixels.
+    """
     target = camera.centre + camera.world_to_camera[2, :3]
     pose = look_at(camera.centre, target, np.array([0.0, -1.0, 0.0]))
     side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
@@ -88,24 +100,30 @@ def level_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
 
 
-def opening(placed: Sequence[FrameRow]) -> FrameRow:
-    """The frame that the viewers open at: of the heaviest, the one halfway along."""
+def opening_frame(placed: Sequence[FrameRow]) -> FrameRow:
+    """Return the frame at which the viewers start: the middle one of the frames with the largest weights."""
     weights = [row.weight or 0.0 for row in placed]
-    heaviest = [row for row, weight in zip(placed, weights, strict=True) if weight >= 0.95 * max(weights)]
-    return heaviest[len(heaviest) // 2]
+    largest = [row for row, weight in zip(placed, weights, strict=True) if weight >= 0.95 * max(weights)]
+    return largest[len(largest) // 2]
 
 
 def viewer_data(
     placed: Sequence[FrameRow], scenes: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, Any], dict[int, float]]:
-    """The settings of the two viewers (SuperSplat Viewer's schema, version 2), and their scenes.
+    """Return the settings of both viewers (schema of SuperSplat Viewer, version 2), and their scenes.
 
-    The trajectory is an animation track: its keys are the frames' poses, to which the page goes by the times
-    that are also returned, by frame.
+    The trajectory is an animation track whose keys are the poses of the frames.
+
+    Args:
+        placed: The frames with a pose.
+        scenes: The data of both scenes for the page.
+
+    Returns:
+        The settings, and frame_id -> time in the animation, in seconds.
     """
     poses = {row.frame.frame_id: viewer_pose(camera_of(row.frame)) for row in placed}
     times = {frame_id: index * _SECONDS_PER_FRAME for index, frame_id in enumerate(poses)}
-    start = opening(placed).frame.frame_id
+    start = opening_frame(placed).frame.frame_id
     track = {
         "name": "trajectory",
         "duration": _SECONDS_PER_FRAME * len(poses),

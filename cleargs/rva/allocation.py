@@ -1,5 +1,7 @@
-"""From cues to scores, roles and weights: reliability R, degradation risk B, the reliable set A (paper,
-Appearance Evidence), Supervision assignment and Trajectory Coverage Compensation.
+"""Scores, roles and weights of frames from their appearance cues.
+
+Implements the paper's Appearance Evidence (reliability R, degradation risk B, reliable set A), Supervision
+Assignment and Trajectory Coverage Compensation. Frames are always in trajectory order.
 """
 
 from __future__ import annotations
@@ -20,16 +22,16 @@ _ROUNDING = 1e-9  # 0.55 * 20 is 11 frames, not 12
 
 
 class Rule(StrEnum):
-    """What a suppressed frame was reactivated for."""
+    """Reason to reactivate a suppressed frame."""
 
     COVERAGE = "coverage"
-    """Its bin had no active frame (the paper's Trajectory Coverage Compensation)."""
+    """The bin had no active frame (the paper's Trajectory Coverage Compensation)."""
     ACTIVE_SHARE = "active_share"
-    """Fewer frames than `AssessmentConfig.active_share` of all were active."""
+    """The share of active frames in the capture was below `AssessmentConfig.active_share`."""
 
 
 class Role(StrEnum):
-    """How much a frame's raw pixels supervise the scene, from most to least."""
+    """Amount of supervision by a frame's raw pixels, from most to least."""
 
     STRONG = "strong"
     GEOMETRIC = "geometric"
@@ -42,36 +44,39 @@ def appearance_scores(
     cues: ArrayF64,  # [N, 11] in [0, 1], columns as tables.CUE_COLUMNS
     config: AssessmentConfig,
 ) -> tuple[ArrayF64, ArrayF64]:  # R [N], B [N], both in [0, 1]
-    """R = w_R . r and B = w_B . b. The sums run cue by cue, so that a row's score needs that row alone."""
+    """Return the reliability R = w_R . r and the degradation risk B = w_B . b of each frame.
+
+    Sums are over one cue at a time, so that the bits of a frame's scores do not depend on the other frames.
+    """
     r, b = cues[:, : len(R_CUES)], cues[:, len(R_CUES) :]
     R = sum((w * r[:, k] for k, w in enumerate(config.w_R)), start=np.zeros(len(cues)))
     B = sum((w * b[:, k] for k, w in enumerate(config.w_B)), start=np.zeros(len(cues)))
-    # The weights sum to 1 up to rounding: keep a perfect frame at 1 exactly.
+    # The weights sum to 1 except for rounding. A perfect frame gets exactly 1.
     return np.clip(R, 0.0, 1.0), np.clip(B, 0.0, 1.0)
 
 
 def is_reliable(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> ArrayBool:
-    """Membership in the appearance-reliable set A = {R >= tau_R, B <= tau_B}."""
+    """Return a mask [N] of the appearance-reliable set A = {R >= tau_R, B <= tau_B}."""
     return np.asarray((config.tau_R <= R) & (config.tau_B >= B))
 
 
 def best_frames(R: ArrayF64, B: ArrayF64, count: int) -> ArrayBool:  # [N] each, in trajectory order
-    """The ``count`` frames of the largest R - B; ties go to the earlier."""
+    """Return a mask of the ``count`` frames with the largest R - B; ties go to the earlier frame."""
     chosen = np.zeros(len(R), dtype=bool)
     chosen[np.argsort(B - R, kind="stable")[:count]] = True
     return chosen
 
 
 def stand_in_set(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> ArrayBool:
-    """The best frames by R - B, a share `stand_in_share` of them and at least one (none of none).
+    """Return a mask of the frames that replace an empty set A in the geometry.
 
-    They take the place of an empty set A in the geometry.
+    These are the best by R - B: a share `stand_in_share` of the frames, at least one if there are frames.
     """
     return best_frames(R, B, max(1, round(config.stand_in_share * len(R))))
 
 
 def standard_roles(R: ArrayF64, B: ArrayF64, G: ArrayF64, config: AssessmentConfig) -> Roles:  # [N] each
-    """The standard supervision conditions, evaluated from top to bottom; suppressed where none holds."""
+    """Return the first role whose conditions hold (strong, geometric, auxiliary), else suppressed."""
     geometric = (config.geometric_G <= G) & (config.geometric_B >= B)
     auxiliary = (config.auxiliary_R <= R) & (config.auxiliary_G <= G) & (config.auxiliary_B >= B)
     return np.select(
@@ -84,7 +89,7 @@ def standard_roles(R: ArrayF64, B: ArrayF64, G: ArrayF64, config: AssessmentConf
 def reactivation_gain(
     R: ArrayF64, B: ArrayF64, G: ArrayF64, Z: ArrayF64, config: AssessmentConfig
 ) -> ArrayF64:
-    """lambda_G G + lambda_R R + lambda_B (1 - B) + lambda_Z Z (paper, eq. tca_selection)."""
+    """Return lambda_G G + lambda_R R + lambda_B (1 - B) + lambda_Z Z [N] (paper, eq. tca_selection)."""
     quality = config.lambda_R * R + config.lambda_B * (1.0 - B)
     return np.asarray(config.lambda_G * G + quality + config.lambda_Z * Z)
 
@@ -95,28 +100,30 @@ def reactivate(
     gain: ArrayF64,  # [N] from `reactivation_gain`
     config: AssessmentConfig,
 ) -> Roles:  # [N] a `Rule` where a suppressed frame is reactivated, "" elsewhere
-    """Which suppressed frames supervise after all, and why.
+    """Choose suppressed frames that supervise after all, with the reason.
 
-    Every bin without an active frame gets the frame i*_m of the largest gain, as in the paper; then the
-    capture gets the best of all its bins, up to ``active_share``. Ties go to the earlier frame.
+    First each bin without an active frame gets its frame i*_m of the largest gain, as in the paper. Then the
+    frames of largest gain in the whole capture follow, up to ``active_share``. If gains are equal, the
+    earlier frame is chosen.
     """
     rules = np.full(len(roles), "", dtype=f"<U{max(map(len, Rule))}")
     active = roles != Role.SUPPRESSED
 
-    def wake(members: npt.NDArray[np.intp], wanted: int, rule: Rule) -> None:
-        asleep = members[~active[members]]
+    def activate(members: npt.NDArray[np.intp], wanted: int, rule: Rule) -> None:
+        suppressed = members[~active[members]]
         missing = max(wanted - int(np.count_nonzero(active[members])), 0)
-        best = asleep[np.argsort(-gain[asleep], kind="stable")[:missing]]
+        best = suppressed[np.argsort(-gain[suppressed], kind="stable")[:missing]]
         rules[best], active[best] = rule.value, True
 
     for index in np.unique(bins):
-        wake(np.flatnonzero(bins == index), 1, Rule.COVERAGE)
-    wake(np.arange(len(roles)), math.ceil(config.active_share * len(roles) - _ROUNDING), Rule.ACTIVE_SHARE)
+        activate(np.flatnonzero(bins == index), 1, Rule.COVERAGE)
+    target = math.ceil(config.active_share * len(roles) - _ROUNDING)
+    activate(np.arange(len(roles)), target, Rule.ACTIVE_SHARE)
     return rules
 
 
 def supervision_weights(roles: Roles, R: ArrayF64, G: ArrayF64, config: AssessmentConfig) -> ArrayF64:
-    """The weight w in [0, 1] that the table gives to each role."""
+    """Return the supervision weight w [N] in [0, 1] of each frame (paper, Supervision Assignment)."""
 
     def attenuated(mix: tuple[float, float]) -> ArrayF64:
         return config.attenuated_base + config.attenuated_gain * (mix[0] * R + mix[1] * G)
@@ -131,14 +138,14 @@ def supervision_weights(roles: Roles, R: ArrayF64, G: ArrayF64, config: Assessme
             np.zeros(len(R)),
         ],
     )
-    return np.asarray(np.clip(weight, 0.0, 1.0))  # base + gain may pass 1 by rounding
+    return np.asarray(np.clip(weight, 0.0, 1.0))  # base + gain may exceed 1 by rounding
 
 
-def keep_sharp(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> tuple[Roles, ArrayF64]:  # [N] each
-    """Roles and weights of the baseline that drops blurry frames.
+def binary_roles(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> tuple[Roles, ArrayF64]:  # [N] each
+    """Return the roles and weights of the baseline that drops blurry frames.
 
-    A share `binary_share` of the frames (rounded up, at least one), best by R - B, and every reliable frame
-    beyond it get weight 1, the others 0.
+    The best frames by R - B get weight 1: a share `binary_share` of them (rounded up, at least one) and every
+    other reliable frame. The rest gets weight 0.
     """
     reliable = is_reliable(R, B, config)
     count = max(1, math.ceil(config.binary_share * len(R) - _ROUNDING))
@@ -150,6 +157,6 @@ def keep_sharp(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> tuple[Role
 
 
 def effective_sample_size(weight: ArrayF64) -> float:
-    """Kish's (sum w)^2 / sum w^2: how many equally weighted frames the weights are worth; 0 for none."""
+    """Return Kish's effective sample size (sum w)^2 / sum w^2, in frames. It is 0 if all weights are 0."""
     squares = float(np.dot(weight, weight))
     return float(weight.sum()) ** 2 / squares if squares > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""All of RVA's maths in one call: cues, poses and observations in, rows and figures of both tables out."""
+"""All RVA computations in one call: from cues, poses and observations to the two tables and the summary."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ S = TypeVar("S", bound=np.generic)
 
 @dataclass(frozen=True)
 class Poses:
-    """World-to-camera poses (OpenCV axes) of N frames; rows of unregistered frames are not read."""
+    """World-to-camera poses (OpenCV axes) of N frames. The values of unregistered frames are not used."""
 
     rotations: ArrayF64  # [N, 3, 3]
     translations: ArrayF64  # [N, 3]
@@ -33,7 +33,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Observations:
-    """Which frame observes which point: the paper's P_i as pairs."""
+    """Pairs of a frame and a point that it observes: the paper's sets P_i."""
 
     frame_id: ArrayInt  # [M]
     point_id: ArrayInt  # [M]
@@ -41,8 +41,9 @@ class Observations:
 
 @dataclass(frozen=True)
 class Assessment:
-    """One entry a frame, in the order given; geometry is NaN (bin -1) where the frame is unregistered
-    or not scored.
+    """Results per frame, in the order of the arguments of `assess`; symbols as in the paper.
+
+    The geometry of unregistered and unscored frames is NaN (bin -1).
     """
 
     R: ArrayF64
@@ -56,7 +57,7 @@ class Assessment:
     bin: npt.NDArray[np.int32]
     Z: ArrayF64
     role: Roles
-    reactivated_for: Roles  # a `Rule`, "" where the frame is not reactivated
+    reactivated_for: Roles  # a `Rule`; "" for frames that are not reactivated
     weight: ArrayF64
     covered: ArrayBool  # [bins] active frames before reactivation
     bin_edges: ArrayF64  # [bins + 1] cumulative pose motion
@@ -64,23 +65,29 @@ class Assessment:
 
 def assess(
     frame_id: ArrayInt,  # [N] distinct; orders the trajectory
-    cues: ArrayF64,  # [N, 11] in [0, 1]; NaN in the row of a frame that could not be scored
+    cues: ArrayF64,  # [N, 11] in [0, 1]; NaN in the row of an unscored frame
     poses: Poses,
     observations: Observations,
     config: AssessmentConfig,
 ) -> Assessment:
-    """Scores, geometry, bins, roles and weights of the training frames.
+    """Compute scores, geometry, bins, roles and weights of the training frames.
 
-    Observations by other frames (held-out ones, say) and by unregistered frames are ignored: neither P_rel
-    nor n_p knows of them. A frame that could not be scored is treated like one without a pose, its points
-    included. Permuting the rows of the arguments permutes the result. With ``config.enabled``
-    false every registered frame is strong with weight 1, with ``config.weighting`` "binary" the better ones
-    are; all other columns stay what they are.
+    Observations by held-out or unregistered frames are ignored: they count neither in P_rel nor in n_p. An
+    unscored frame is treated like an unregistered one. If the rows of the arguments are permuted, the result
+    is permuted in the same way.
+
+    Args:
+        frame_id: Ids of the training frames.
+        cues: Appearance cues; columns as `tables.CUE_COLUMNS`.
+        poses: One row per frame.
+        observations: Pairs of any frames of the capture.
+        config: With ``enabled`` false all registered frames are strong with weight 1. With ``weighting``
+            "binary" the better ones get weight 1, the others 0. Other results do not change.
     """
     R, B = allocation.appearance_scores(cues, config)
     by_id = np.argsort(frame_id, kind="stable")
     usable = poses.registered & ~np.isnan(cues).any(axis=1)
-    rows = by_id[usable[by_id]]  # the trajectory: registered and scored frames by frame_id
+    rows = by_id[usable[by_id]]  # the trajectory: rows of registered and scored frames, by frame_id
     r, b = R[rows], B[rows]
 
     reliable = allocation.is_reliable(r, b, config)
@@ -105,14 +112,14 @@ def assess(
         roles = np.where(rules != "", Role.REACTIVATED.value, roles)
     weight = allocation.supervision_weights(roles, r, G, config)
     if config.weighting == "binary":
-        roles, weight = allocation.keep_sharp(r, b, config)
+        roles, weight = allocation.binary_roles(r, b, config)
     if not config.enabled:
         roles, weight = np.full_like(roles, Role.STRONG.value), np.ones(len(rows))
         rules = np.full_like(rules, "")
 
-    def spread(values: npt.NDArray[S], elsewhere: object) -> npt.NDArray[S]:
-        """Rows of the trajectory back to the rows of the arguments; ``elsewhere`` for the other frames."""
-        whole = np.full(len(frame_id), elsewhere, dtype=values.dtype)
+    def scatter(values: npt.NDArray[S], fill: object) -> npt.NDArray[S]:
+        """Return values of the trajectory in the order of the arguments, with ``fill`` for other frames."""
+        whole = np.full(len(frame_id), fill, dtype=values.dtype)
         whole[rows] = values
         return whole
 
@@ -120,24 +127,24 @@ def assess(
     return Assessment(
         R=R,
         B=B,
-        reliable=spread(reliable, False),
-        stand_in=spread(stand_in, False),
-        C=spread(C, nan),
-        D=spread(D, nan),
-        O=spread(overlap, nan),
-        G=spread(G, nan),
-        bin=spread(bins.index, -1),
-        Z=spread(bins.centrality, nan),
-        role=spread(roles, Role.SUPPRESSED.value),
-        reactivated_for=spread(rules, ""),
-        weight=spread(weight, 0.0),
+        reliable=scatter(reliable, False),
+        stand_in=scatter(stand_in, False),
+        C=scatter(C, nan),
+        D=scatter(D, nan),
+        O=scatter(overlap, nan),
+        G=scatter(G, nan),
+        bin=scatter(bins.index, -1),
+        Z=scatter(bins.centrality, nan),
+        role=scatter(roles, Role.SUPPRESSED.value),
+        reactivated_for=scatter(rules, ""),
+        weight=scatter(weight, 0.0),
         covered=covered,
         bin_edges=bins.edges,
     )
 
 
 def poses_from(frames: Sequence[Frame]) -> Poses:
-    """Rotation matrices and translations, world to camera; identity where a frame has no pose."""
+    """Return the poses of ``frames``; the identity for unregistered frames."""
     rotations = np.tile(np.eye(3), (len(frames), 1, 1))
     translations = np.zeros((len(frames), 3))
     registered = np.array([frame.registered for frame in frames], dtype=bool)
@@ -153,10 +160,10 @@ def frames_table(
     frame_id: npt.NDArray[np.int32],  # [N] ascending
     names: Sequence[str],
     evaluator: str,
-    cues: ArrayF64,  # [N, 11], NaN where a frame could not be scored
+    cues: ArrayF64,  # [N, 11], NaN for unscored frames
     result: Assessment,
 ) -> pa.Table:
-    """The rows of rva/frames.parquet; NaN becomes null."""
+    """Return the table of rva/frames.parquet. NaN becomes null."""
     nulls = dict.fromkeys(("C", "D", "O", "G", "bin", "Z"), result.bin < 0)
     nulls["reactivated_for"] = result.reactivated_for == ""
     columns: dict[str, Any] = {
@@ -174,11 +181,11 @@ def frames_table(
 
 
 def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:  # [N] ascending
-    """The rows of rva/bins.parquet."""
+    """Return the table of rva/bins.parquet."""
     count = len(result.covered)
     placed = result.bin[result.bin >= 0]
     active = result.bin[(result.bin >= 0) & (result.weight > 0.0)]
-    revived = result.role == Role.REACTIVATED
+    reactivated = result.role == Role.REACTIVATED
     return pa.table(
         {
             "bin": np.arange(count, dtype=np.int32),
@@ -187,16 +194,14 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
             "n_frames": np.bincount(placed, minlength=count).astype(np.int32),
             "n_active": np.bincount(active, minlength=count).astype(np.int32),
             "covered": result.covered,
-            "reactivated": [frame_id[revived & (result.bin == k)] for k in range(count)],
+            "reactivated": [frame_id[reactivated & (result.bin == k)] for k in range(count)],
         },
         schema=BINS,
     )
 
 
 def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
-    """Figures for the manifest: frames a role, weights in steps of 0.1, reliable frames, effective sample
-    size.
-    """
+    """Return figures for the manifest: frames per role, a histogram of weights, effective sample size."""
     roles, rules = Counter(result.role.tolist()), Counter(result.reactivated_for.tolist())
     histogram, edges = np.histogram(result.weight, bins=10, range=(0.0, 1.0))
     return {

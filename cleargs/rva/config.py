@@ -1,5 +1,6 @@
-"""Settings of the functions here: every number of the paper's table tab:rva_params, and what the paper leaves
-open. The stage's own, `cleargs.stages.rva`, inherits them.
+"""Settings of RVA: all numbers of the paper's table tab:rva_params, and choices that the paper leaves open.
+
+The settings of the stage (`cleargs.stages.rva`) inherit them.
 """
 
 from __future__ import annotations
@@ -14,78 +15,80 @@ from pydantic import Field, field_validator, model_validator
 from cleargs.base_model import FrozenModel, Settings, Unit
 from cleargs.plugins import require_known
 
-_SUM_TOLERANCE = 1e-9  # decimal weights such as 0.30 + 0.25 + ... do not add up to 1 exactly in binary
+_SUM_TOLERANCE = 1e-9  # weights such as 0.30 + 0.25 + ... do not sum to exactly 1 in binary
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 """A number above 0 and at most 1."""
 
 EVALUATORS = ("statistics", "qwen3-vl")
-"""Those that ship with ClearGS."""
+"""Evaluators that ship with ClearGS."""
 
 MODEL_VARIABLE = "CLEARGS_VLM_MODEL"
-"""Environment variable with the model's name, where ``qwen.model`` gives none."""
+"""Environment variable with the model's name, used if ``qwen.model`` is empty."""
 
-_PLACE = Field(json_schema_extra={"key": False})
-"""Marks where the work is done, not what comes of it: stays out of the stage's key."""
+_NOT_IN_KEY = Field(json_schema_extra={"key": False})
+"""Keeps a setting that does not change the scores out of the stage's key."""
 
 
 class QwenConfig(Settings):
-    """The evaluator ``qwen3-vl``: a vision-language model behind a server, or in a folder of this machine.
+    """Settings of the evaluator ``qwen3-vl``: a vision-language model on a server or in a local folder.
 
-    The server's key is no setting: it comes from the environment (CLEARGS_VLM_API_KEY) and is written
-    nowhere.
+    The server's API key is not a setting. It comes from the environment (CLEARGS_VLM_API_KEY) and is never
+    written to a file.
     """
 
     model: str = Field(
         "",
         max_length=200,
-        description=f"name of the model at the server; empty: from {MODEL_VARIABLE} in the environment",
+        description=f"name of the model on the server; empty: from {MODEL_VARIABLE} in the environment",
     )
-    base_url: Annotated[str, _PLACE] = Field(
+    base_url: Annotated[str, _NOT_IN_KEY] = Field(
         "",
-        description="OpenAI-compatible server (vLLM, llama.cpp, Ollama, LM Studio), up to and with /v1; "
-        "empty: from CLEARGS_VLM_URL in the environment, else http://127.0.0.1:8000/v1",
+        description="address of an OpenAI-compatible server (vLLM, llama.cpp, Ollama, LM Studio), including "
+        "/v1; empty: from CLEARGS_VLM_URL in the environment, else http://127.0.0.1:8000/v1",
     )
-    model_dir: Annotated[str, _PLACE] = Field(
-        "", description="folder of a Qwen3-VL model to run in process (extra vlm) in place of a server"
+    model_dir: Annotated[str, _NOT_IN_KEY] = Field(
+        "", description="folder of a Qwen3-VL model to run locally (extra vlm) instead of on a server"
     )
     prompt: ClassVar[int] = 1
-    """Version of the prompt."""
+    """Version of the prompt; part of the evaluator's name in the table."""
     image_size: int = Field(
         1024, ge=64, le=4096, description="px; larger images are reduced to this long side"
     )
-    max_tokens: int = Field(1024, ge=64, le=32_768, description="longest reply")
+    max_tokens: int = Field(1024, ge=64, le=32_768, description="maximum length of a reply, in tokens")
     local_threads: int = Field(
         4,
         ge=1,
         le=256,
-        description="threads of a model in process on the CPU; its sums depend on their number",
+        description="CPU threads of a local model; its results depend on this number",
     )
-    concurrency: Annotated[int, _PLACE] = Field(4, ge=1, le=256, description="requests under way at once")
-    timeout_s: Annotated[float, _PLACE] = Field(
-        120.0, gt=0.0, le=3600.0, description="longest wait for one reply"
+    concurrency: Annotated[int, _NOT_IN_KEY] = Field(
+        4, ge=1, le=256, description="maximum number of requests at the same time"
     )
-    attempts: Annotated[int, _PLACE] = Field(
-        5, ge=1, le=100, description="tries of one request while the server is busy, fails or does not answer"
+    timeout_s: Annotated[float, _NOT_IN_KEY] = Field(
+        120.0, gt=0.0, le=3600.0, description="maximum wait for one reply"
     )
-    backoff_s: Annotated[float, _PLACE] = Field(
-        1.0, ge=0.0, le=60.0, description="pause before the second try; doubled before each further one"
+    attempts: Annotated[int, _NOT_IN_KEY] = Field(
+        5, ge=1, le=100, description="tries of one request if the server is busy, fails or does not answer"
     )
-    asks: Annotated[int, _PLACE] = Field(
-        3, ge=1, le=20, description="how often a frame is asked for while the replies break the schema"
+    backoff_s: Annotated[float, _NOT_IN_KEY] = Field(
+        1.0, ge=0.0, le=60.0, description="pause before the second try; doubled before each further try"
+    )
+    asks: Annotated[int, _NOT_IN_KEY] = Field(
+        3, ge=1, le=20, description="questions per frame if the replies do not match the schema"
     )
 
 
 class EvaluatorConfig(FrozenModel):
-    """Choice of the evaluator that judges the appearance of frames."""
+    """Choice of the evaluator that scores the appearance of frames."""
 
     evaluator: str = Field(
         "statistics",
         json_schema_extra={"plugin": "evaluators"},
-        description="who judges appearance; statistics: image and video statistics, no network; "
-        "qwen3-vl: the paper's vision-language model; or one that another package brings",
+        description="evaluator of the appearance; statistics: image and video statistics, no network; "
+        "qwen3-vl: the paper's vision-language model; or the name of a plugin",
     )
-    qwen: QwenConfig = Field(QwenConfig(), description="how qwen3-vl is asked")
+    qwen: QwenConfig = Field(QwenConfig(), description="settings of qwen3-vl")
 
     @field_validator("evaluator")
     @classmethod
@@ -95,7 +98,7 @@ class EvaluatorConfig(FrozenModel):
     @model_validator(mode="before")
     @classmethod
     def _model_from_environment(cls, data: Any) -> Any:
-        """Resolve the name of the model here, so that ``run.toml`` and the stage's key hold it."""
+        """Resolve the name of the model here, so that ``run.toml`` and the stage's key contain it."""
         if not isinstance(data, Mapping) or data.get("evaluator") != "qwen3-vl":
             return data
         qwen = data.get("qwen", {})
@@ -109,83 +112,83 @@ class EvaluatorConfig(FrozenModel):
             check_base_url(self.qwen.base_url)
         if self.evaluator == "qwen3-vl" and bool(self.qwen.model) == bool(self.qwen.model_dir):
             raise ValueError(
-                "qwen3-vl needs either qwen.model (the name of a model at the server) or qwen.model_dir "
+                "qwen3-vl needs either qwen.model (the name of a model on the server) or qwen.model_dir "
                 "(a model folder)"
             )
         return self
 
 
 class AssessmentConfig(Settings):
-    """All of RVA but the evaluator."""
+    """All settings of RVA except those of the evaluator. Defaults are the paper's where it gives a value."""
 
     # Geometric evidence from poses and observations.
     frames_per_bin: int = Field(
-        8, ge=1, le=10_000, description="registered frames a trajectory bin holds on average"
+        8, ge=1, le=10_000, description="mean number of registered frames per trajectory bin"
     )
-    gamma_c: Unit = Field(0.65, description="share of the camera-centre distance in a pose distance")
-    gamma_v: Unit = Field(0.35, description="share of the view angle in a pose distance")
+    gamma_c: Unit = Field(0.65, description="weight of the camera-centre distance in a pose distance")
+    gamma_v: Unit = Field(0.35, description="weight of the view angle in a pose distance")
     alpha: Unit = Field(0.45, description="weight of the coverage gain C in the geometric utility G")
     beta: Unit = Field(0.35, description="weight of the pose diversity D in G")
     eta: Unit = Field(0.30, description="weight of the visibility redundancy O, subtracted from G")
 
     # Scores from cues, and the reliable set.
     stand_in_share: ClassVar[float] = 0.10
-    """When no frame is reliable, this share of the registered frames (at least one), best by R - B, stands in
-    for the reliable set in the geometry."""
+    """If no frame is reliable, this share of the registered frames (at least one; best by R - B) replaces the
+    reliable set in the geometry."""
     w_R: tuple[Unit, Unit, Unit, Unit, Unit] = Field(
         (0.30, 0.25, 0.20, 0.15, 0.10),
-        description="weights in R of sharpness, structure, texture, cleanness, exposure; they sum to 1",
+        description="weights of sharpness, structure, texture, cleanness, exposure in R; they sum to 1",
     )
     w_B: tuple[Unit, Unit, Unit, Unit, Unit, Unit] = Field(
         (0.25, 0.15, 0.20, 0.15, 0.15, 0.10),
-        description="weights in B of motion blur, defocus, ghosting, exposure failure, unreliable texture, "
-        "artifacts; they sum to 1",
+        description="weights of motion blur, defocus, ghosting, exposure failure, unreliable texture, "
+        "artifacts in B; they sum to 1",
     )
-    tau_R: Unit = Field(0.70, description="a reliable (and strong) frame has at least this R")
-    tau_B: Unit = Field(0.60, description="a reliable (and strong) frame has at most this B")
+    tau_R: Unit = Field(0.70, description="minimum R of a reliable (strong) frame")
+    tau_B: Unit = Field(0.60, description="maximum B of a reliable (strong) frame")
 
     # Roles and weights from scores and geometry.
     enabled: bool = Field(
         True,
-        description="false: the all-view ablation. Every registered frame gets weight 1 and the role strong; "
+        description="false: the all-view ablation. All registered frames get weight 1 and the role strong; "
         "cues, scores and geometry are still computed and reported",
     )
     weighting: Literal["graded", "binary"] = Field(
         "graded",
         description="graded: the paper's roles and weights; binary: the baseline that drops blurry frames. "
-        "Weight 1 for the better frames by R - B, 0 for the others, without coverage compensation",
+        "The better frames by R - B get weight 1, the others 0, without coverage compensation",
     )
     binary_share: Share = Field(
         0.5,
-        description="binary: this share of the registered frames (at least one) is kept, and every reliable "
-        "frame beyond it",
+        description="binary: this share of the registered frames (at least one) is kept, as well as all "
+        "other reliable frames",
     )
     coverage: bool = Field(
-        True, description="reactivate suppressed frames where the trajectory would have a hole"
+        True, description="reactivate suppressed frames in trajectory bins without active frames"
     )
     active_share: Unit = Field(
         1.0,
         description="with coverage: suppressed frames are reactivated until this share of the registered "
-        "frames is active; 0: the paper's",
+        "frames is active; 0: the paper's behaviour",
     )
-    lambda_G: Unit = Field(0.35, description="weight of G when a frame to reactivate is chosen")
-    lambda_R: Unit = Field(0.25, description="weight of R when a frame to reactivate is chosen")
-    lambda_B: Unit = Field(0.30, description="weight of 1 - B when a frame to reactivate is chosen")
+    lambda_G: Unit = Field(0.35, description="weight of G in the choice of a frame to reactivate")
+    lambda_R: Unit = Field(0.25, description="weight of R in the choice of a frame to reactivate")
+    lambda_B: Unit = Field(0.30, description="weight of 1 - B in the choice of a frame to reactivate")
     lambda_Z: Unit = Field(
-        0.10, description="weight of the centrality Z when a frame to reactivate is chosen"
+        0.10, description="weight of the centrality Z in the choice of a frame to reactivate"
     )
     reactivated_weight: Share = Field(0.12, description="weight of a reactivated frame")
-    strong_base: Share = Field(0.80, description="weight of a strong frame: base + gain R")
-    strong_gain: Unit = Field(0.20, description="weight of a strong frame: base + gain R")
-    geometric_G: Unit = Field(0.60, description="a geometric frame has at least this G")
-    geometric_B: Unit = Field(0.80, description="a geometric frame has at most this B")
+    strong_base: Share = Field(0.80, description="base in the weight of a strong frame, base + gain R")
+    strong_gain: Unit = Field(0.20, description="gain in the weight of a strong frame, base + gain R")
+    geometric_G: Unit = Field(0.60, description="minimum G of a geometric frame")
+    geometric_B: Unit = Field(0.80, description="maximum B of a geometric frame")
     geometric_mix: ClassVar[tuple[float, float]] = (0.35, 0.65)
-    """The paper's: a geometric frame weighs base + gain (mix[0] R + mix[1] G)."""
-    auxiliary_R: Unit = Field(0.35, description="an auxiliary frame has at least this R")
-    auxiliary_G: Unit = Field(0.25, description="an auxiliary frame has at least this G")
-    auxiliary_B: Unit = Field(0.75, description="an auxiliary frame has at most this B")
+    """The weight of a geometric frame is base + gain (mix[0] R + mix[1] G); the paper's values."""
+    auxiliary_R: Unit = Field(0.35, description="minimum R of an auxiliary frame")
+    auxiliary_G: Unit = Field(0.25, description="minimum G of an auxiliary frame")
+    auxiliary_B: Unit = Field(0.75, description="maximum B of an auxiliary frame")
     auxiliary_mix: ClassVar[tuple[float, float]] = (0.50, 0.50)
-    """The paper's: an auxiliary frame weighs base + gain (mix[0] R + mix[1] G)."""
+    """The weight of an auxiliary frame is base + gain (mix[0] R + mix[1] G); the paper's values."""
     attenuated_base: Share = Field(0.30, description="base of the weight of geometric and auxiliary frames")
     attenuated_gain: Unit = Field(0.30, description="gain of the weight of geometric and auxiliary frames")
 
@@ -197,16 +200,19 @@ class AssessmentConfig(Settings):
                 raise ValueError(f"{name} must sum to 1, not {total:g}")
         for base, gain in (("strong_base", "strong_gain"), ("attenuated_base", "attenuated_gain")):
             if getattr(self, base) + getattr(self, gain) > 1.0 + _SUM_TOLERANCE:
-                raise ValueError(f"{base} + {gain} must not exceed 1: it is the largest weight of a frame")
+                raise ValueError(f"{base} + {gain} must not exceed 1, the largest weight of a frame")
         return self
 
 
 def check_base_url(url: str) -> None:
-    """Raise ValueError for what is no plain http(s) address. The message does not repeat it: it may hold a
-    password.
+    """Raise ValueError unless ``url`` is a plain http(s) address.
+
+    The message does not quote the address, since it may contain a password.
     """
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise ValueError("the server's base_url must start with http:// or https:// and name a host")
     if "@" in parts.netloc or parts.query or parts.fragment:
-        raise ValueError("the server's base_url may hold no user, password or query: use CLEARGS_VLM_API_KEY")
+        raise ValueError(
+            "the server's base_url must not contain a user, password or query: use CLEARGS_VLM_API_KEY"
+        )

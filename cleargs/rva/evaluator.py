@@ -1,5 +1,6 @@
-"""Who judges the appearance of a frame: the protocol that all evaluators follow, and what was found out about
-single frames, kept so that adding frames to a capture costs only those.
+"""Protocol of the evaluators, which score the appearance of frames, and a cache of results per frame.
+
+With the cache only the new frames are evaluated after frames are added to a capture.
 """
 
 from __future__ import annotations
@@ -25,16 +26,20 @@ from cleargs.types import AnyImage, ArrayF64, ImageU8, MaskU8
 
 @dataclass(frozen=True)
 class EvaluatedFrame:
-    """A frame as an evaluator gets it: files, so that nobody has to hold a video in memory."""
+    """A frame to evaluate, as files, so that not all images have to be in memory."""
 
     frame_id: int
     image: Path
     mask: Path | None = None
-    """8-bit image of the same size; pixels that are 0 in it are ignored."""
+    """8-bit image of the same size; pixels with value 0 are ignored."""
 
 
 def load_view(view: EvaluatedFrame) -> tuple[ImageU8, MaskU8 | None]:
-    """The frame [H, W, 3] in sRGB and its mask [H, W]. Raises StoreError when one cannot be read."""
+    """Read the frame [H, W, 3] in sRGB and its mask [H, W].
+
+    Raises:
+        StoreError: if a file is unreadable, or if the mask and the image differ in size.
+    """
     hint = "run again with --force ingest"
     try:
         rgb, mask = read_rgb(view.image), read_mask(view.mask) if view.mask else None
@@ -45,8 +50,8 @@ def load_view(view: EvaluatedFrame) -> tuple[ImageU8, MaskU8 | None]:
     return rgb, mask
 
 
-def reduced(image: AnyImage, long_side: int) -> AnyImage:
-    """``image``, by area averaging where its long side exceeds ``long_side`` px."""
+def downscale(image: AnyImage, long_side: int) -> AnyImage:
+    """Return ``image`` with a long side of at most ``long_side`` px, by area averaging."""
     height, width = image.shape[:2]
     scale = long_side / max(height, width)
     if scale >= 1.0:
@@ -60,42 +65,52 @@ class Evaluator(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user calls it in ``rva.evaluator``, with the model it asks where there is one."""
+        """Name of the evaluator in ``rva.evaluator``, with the name of its model if it has one."""
 
     @property
     def version(self) -> int:
-        """Raised when equal images get other cues."""
+        """Number that is raised if a change gives other cues for the same images."""
 
     def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
-        """Cues [n, 11] in [0, 1], columns as `tables.CUE_COLUMNS`, for frames given in trajectory order.
+        """Estimate the cues of frames.
 
-        A row of NaN is a frame that could not be scored; ``reporter`` was told why. Neighbours in ``views``
-        are neighbours in the video. Images are read as they are needed: memory does not grow with their
-        number. The result does not depend on ``threads``.
+        Args:
+            views: Frames in trajectory order; neighbours are neighbours in the video. Their images are read
+                one by one, so that memory does not grow with their number.
+            threads: Number of threads. The result does not depend on it.
+            reporter: Receives the progress, and a warning for each frame that could not be scored.
+
+        Returns:
+            Cues [n, 11] in [0, 1], columns as `tables.CUE_COLUMNS`; NaN for unscored frames.
         """
 
 
 def label(evaluator: Evaluator) -> str:
-    """How the tables name an evaluator."""
+    """Return the name of an evaluator in the tables."""
     return f"{evaluator.name}-{evaluator.version}"
 
 
 @dataclass(frozen=True)
 class ItemCache:
-    """Rows of numbers with named columns, a JSON file each, named by the digest of all that decides them."""
+    """Cache of one row of numbers per frame, as JSON files.
+
+    The name of a file is a digest of everything that determines its row.
+    """
 
     folder: Path | None
-    """None: nothing is kept."""
+    """Folder of the files; None: no cache."""
     columns: Sequence[str]
+    """Names of the numbers in a row."""
     facts: Sequence[object]
-    """JSON values that decide the rows next to the files of the views."""
+    """JSON values that determine the rows together with the files of the frames."""
     bounds: tuple[float, float] = (-math.inf, math.inf)
-    """Rows with a number outside are not taken from files."""
+    """Range of valid numbers. A file with a number outside it is not used."""
 
     def row(self, view: EvaluatedFrame, make: Callable[[EvaluatedFrame], ArrayF64]) -> ArrayF64:
-        """The kept row of ``view``, or else what ``make`` finds; a new file appears whole.
+        """Return the cached row of ``view``. If there is none, call ``make`` and store its row, atomically.
 
-        Raises OSError when a file of the view cannot be read.
+        Raises:
+            OSError: if a file of the frame is unreadable.
         """
         if self.folder is None:
             return make(view)
@@ -109,7 +124,7 @@ class ItemCache:
         return row
 
     def find(self, file: Path) -> ArrayF64 | None:
-        """The row in ``file``; None where there is none, or where it is damaged."""
+        """Return the row in ``file``, or None if the file is missing or damaged."""
         try:
             kept = read_json(file)
             row = np.array([kept[column] for column in self.columns], dtype=np.float64)

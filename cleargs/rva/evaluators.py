@@ -1,4 +1,4 @@
-"""The evaluator that the settings name."""
+"""Creation of the evaluator that the settings name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from cleargs.errors import InputError
-from cleargs.plugins import load_part
+from cleargs.plugins import load_plugin
 from cleargs.rva.config import EVALUATORS, EvaluatorConfig, QwenConfig
 from cleargs.rva.evaluator import Evaluator
 
@@ -18,23 +18,31 @@ Device = Literal["cpu", "cuda"]
 
 
 def check_evaluator(config: EvaluatorConfig) -> None:
-    """Raise InputError when the model of the evaluator that the settings name cannot be had: nobody answers
-    at the server's address, the server has no such model, or the folder holds none that can be loaded.
+    """Check that the evaluator of the settings is available. Load no weights.
+
+    Raises:
+        InputError: if the plugin cannot be loaded, the server does not answer or lacks the model, or the
+            folder does not contain a Qwen3-VL model.
     """
     if config.evaluator == "qwen3-vl":
         _qwen(config.qwen).check()
     elif config.evaluator not in EVALUATORS:
-        load_part("evaluators", config.evaluator)
+        load_plugin("evaluators", config.evaluator)
 
 
 def make_evaluator(
     config: EvaluatorConfig, *, seed: int = 0, device: Device = "cpu", cache: Path | None = None
 ) -> Evaluator:
-    """The evaluator that the settings name: what another package brings is called with ``seed``, ``device``
-    and ``cache``.
+    """Create the evaluator of the settings.
 
-    ``cache`` is a folder in which the evaluator keeps what it found out about single frames.
-    Raises InputError when the evaluator cannot be had: a bad address or key of its server, say.
+    Args:
+        config: Name of the evaluator, and its settings.
+        seed: Seed of a model on a server, or of a plugin.
+        device: Device of a local model.
+        cache: Folder for results of single frames; None: no cache.
+
+    Raises:
+        InputError: if the evaluator is unavailable, for example if the address of its server is invalid.
     """
     if config.evaluator == "statistics":
         from cleargs.rva.statistics import StatisticsEvaluator
@@ -42,14 +50,14 @@ def make_evaluator(
         return StatisticsEvaluator(cache)
     if config.evaluator == "qwen3-vl":
         return _qwen(config.qwen, seed, device, cache)
-    maker: Callable[..., Evaluator] = load_part("evaluators", config.evaluator)
+    maker: Callable[..., Evaluator] = load_plugin("evaluators", config.evaluator)
     return maker(seed=seed, device=device, cache=cache)
 
 
 def _qwen(
     config: QwenConfig, seed: int = 0, device: Device = "cpu", cache: Path | None = None
 ) -> QwenEvaluator:
-    """Raises InputError where the HTTP client of the server is not installed."""
+    """Create a Qwen3-VL evaluator. Raise InputError if the HTTP client of the server is not installed."""
     if config.model_dir:
         from cleargs.rva.vlm.local import QwenFolder  # loads torch
 
@@ -58,7 +66,7 @@ def _qwen(
         from cleargs.rva.vlm.server import QwenServer
     except ImportError as error:
         raise InputError(
-            f"the client of a qwen3-vl server cannot be loaded: {error.msg}",
+            f"the HTTP client for qwen3-vl cannot be loaded: {error.msg}",
             hint="pip install 'cleargs[server]'",
         ) from error
     return QwenServer(config, seed=seed, cache=cache)

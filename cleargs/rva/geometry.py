@@ -1,5 +1,7 @@
-"""Geometric evidence: coverage gain C, pose diversity D, redundancy O and utility G (paper, Geometric
-Evidence); the trajectory cut into bins of equal camera motion, and how central a frame is in its bin.
+"""Geometric evidence: coverage gain C, pose diversity D, redundancy O and utility G, and trajectory bins.
+
+Source: the paper's Geometric Evidence. Bins divide the trajectory into parts of equal camera motion. The
+centrality Z says how close a frame is to the middle of its bin.
 """
 
 from __future__ import annotations
@@ -15,32 +17,32 @@ from cleargs.rva.config import AssessmentConfig
 from cleargs.types import ArrayBool, ArrayF64, ArrayInt
 
 _PAIRS_AT_ONCE = 1 << 20
-"""Pairs of frames held in memory at a time (8 MB an array of float64)."""
+"""Pairs of frames in memory at a time (8 MB per float64 array)."""
 
 
 def camera_centres(
     rotations: ArrayF64,  # [N, 3, 3] world to camera
     translations: ArrayF64,  # [N, 3]
 ) -> ArrayF64:  # [N, 3] in the world
-    """Camera centres -R^T t."""
+    """Return the camera centres -R^T t."""
     return np.asarray(-np.einsum("nij,ni->nj", rotations, translations))
 
 
 def view_directions(rotations: ArrayF64) -> ArrayF64:  # [N, 3, 3] world to camera -> [N, 3] unit vectors
-    """Optical axes in the world: the third row of R (OpenCV axes, z forward)."""
+    """Return the optical axes in the world: the third rows of R (OpenCV axes, z forward)."""
     return rotations[:, 2, :]
 
 
 def view_angle(chord: ArrayF64) -> ArrayF64:
-    """Angle between unit vectors, divided by pi, from the length of their difference.
+    """Return the angle between unit vectors, divided by pi, from the length of their difference.
 
-    Unlike arccos of the dot product it is exact at 0 and accurate for small angles.
+    Unlike the arccos of the dot product, this is exact at 0 and accurate for small angles.
     """
     return np.asarray(2.0 / np.pi * np.arcsin(np.clip(0.5 * chord, 0.0, 1.0)))
 
 
 def largest_distance(points: ArrayF64) -> float:  # [N, 3]
-    """Largest distance between any two points; 0 for fewer than two."""
+    """Return the largest distance between two points; 0 for fewer than two points."""
     return max(
         (float(cdist(points[rows], points).max()) for rows in _row_blocks(len(points), len(points))),
         default=0.0,
@@ -50,12 +52,13 @@ def largest_distance(points: ArrayF64) -> float:  # [N, 3]
 def pose_diversity(
     centres: ArrayF64,  # [N, 3]
     directions: ArrayF64,  # [N, 3] unit vectors
-    reference: ArrayBool,  # [N] the reliable set (or its stand-in)
+    reference: ArrayBool,  # [N] the reliable set (or its replacement)
     config: AssessmentConfig,
 ) -> ArrayF64:  # D [N] in [0, 1]
-    """D_i = max over reference frames j != i of gamma_c d^c_ij + gamma_v d^v_ij; 0 where there is no such j.
+    """Return D_i = max over reference frames j != i of gamma_c d^c_ij + gamma_v d^v_ij; 0 without such a j.
 
-    d^c is the distance of the camera centres over the largest one in the capture, d^v the view angle over pi.
+    d^c is the distance between camera centres divided by the largest one of the capture. d^v is the angle
+    between view directions divided by pi.
     """
     D = np.zeros(len(centres))
     others = np.flatnonzero(reference)
@@ -66,7 +69,9 @@ def pose_diversity(
         angle = view_angle(cdist(directions[rows], directions[others]))
         distance = cdist(centres[rows], centres[others]) / scale if scale > 0.0 else np.zeros_like(angle)
         pair = config.gamma_c * distance + config.gamma_v * angle
-        pair[rows[:, None] == others[None, :]] = 0.0  # j = i: the floor of a maximum of distances
+        pair[rows[:, None] == others[None, :]] = (
+            0.0  # exclude j = i: 0 does not change a maximum of distances
+        )
         D[rows] = pair.max(axis=1)
     return D
 
@@ -76,9 +81,9 @@ def visibility(
     observer: ArrayInt,  # [M] id of the frame that observes
     point_id: ArrayInt,  # [M]
 ) -> sparse.csr_array:  # [N, P] of 0 and 1
-    """The sets P_i as a sparse matrix; what other frames observe is left out.
+    """Return the sets P_i as a sparse matrix, without the observations of other frames.
 
-    A point that a frame lists twice counts once. Columns are the points in ascending id, so that sums over
+    Repeated observations count once. Columns are the points in ascending order of id, so that sums over
     points do not depend on the order of the frames.
     """
     kept = np.isin(observer, frame_id)
@@ -93,10 +98,9 @@ def visibility(
 
 
 def coverage_gain(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # [N, P], [N] -> C [N] in [0, 1]
-    """C_i: the share of frame i's points, weighted by 1 / sqrt(n_p), that no reference frame sees; 0 without
-    points.
+    """Return C_i: the weighted share of frame i's points that no reference frame sees; 0 without points.
 
-    n_p counts the frames of ``seen`` that observe p.
+    The weight of a point is 1 / sqrt(n_p), where n_p is the number of frames in ``seen`` that observe it.
     """
     observers = np.bincount(seen.indices, minlength=seen.shape[1])
     weight = 1.0 / np.sqrt(np.maximum(observers, 1))
@@ -108,10 +112,10 @@ def coverage_gain(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # 
 
 
 def redundancy(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # [N, P], [N] -> O [N] in [0, 1]
-    """O_i = max over reference frames j != i of |P_i and P_j| / |P_i or P_j|; 0 where there is no such j.
+    """Return O_i = max over reference frames j != i of |P_i and P_j| / |P_i or P_j|; 0 without such a j.
 
-    Only pairs that share a point are visited: the work is the sum over points of (observers x reference
-    observers).
+    Only pairs that share a point are visited. The cost is the sum over points of observers x reference
+    observers.
     """
     largest = np.zeros(seen.shape[0])
     size = np.diff(seen.indptr)
@@ -127,17 +131,17 @@ def redundancy(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # [N,
 
 
 def geometric_utility(C: ArrayF64, D: ArrayF64, O: ArrayF64, config: AssessmentConfig) -> ArrayF64:
-    """G = clip to [0, 1] of alpha C + beta D - eta O (paper, eq. vista_geometry)."""
+    """Return G = alpha C + beta D - eta O, clipped to [0, 1] (paper, eq. vista_geometry)."""
     return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Bins:
-    """Where each frame lies on the trajectory."""
+    """Position of each frame in the trajectory bins."""
 
     index: npt.NDArray[np.int32]  # [N] bin of each frame
     centrality: ArrayF64  # [N] Z in [0, 1], 1 at the middle of the bin
-    edges: ArrayF64  # [M + 1] cumulative motion at the bins' borders
+    edges: ArrayF64  # [M + 1] cumulative motion at the borders of the bins
 
 
 def cumulative_motion(
@@ -145,10 +149,9 @@ def cumulative_motion(
     directions: ArrayF64,  # [N, 3] unit vectors
     config: AssessmentConfig,
 ) -> ArrayF64:  # s [N], from 0
-    """Pose motion up to each frame: a step is gamma_c (normalised centre distance) + gamma_v (view angle /
-    pi).
+    """Return the cumulative pose motion s at each frame.
 
-    Centre distances are divided by the largest pairwise one of the capture, as in the pose diversity.
+    A step is gamma_c d^c + gamma_v d^v between neighbours, with the distances of `pose_diversity`.
     """
     if not len(centres):
         return np.zeros(0)
@@ -161,10 +164,10 @@ def cumulative_motion(
 
 
 def cut_into_bins(motion: ArrayF64, frames_per_bin: int) -> Bins:  # [N] cumulative, in trajectory order
-    """M = max(1, round(N / frames_per_bin)) bins of equal motion.
+    """Divide the trajectory into M = max(1, round(N / frames_per_bin)) bins of equal motion.
 
-    With x = M s / S: bin = min(floor(x), M - 1) and Z = 1 - |2 (x - bin) - 1|. A camera that does not move
-    (S = 0) has one bin with Z = 1.
+    With the total motion S and x = M s / S: bin = min(floor(x), M - 1) and Z = 1 - |2 (x - bin) - 1|. A
+    camera that does not move (S = 0) has one bin with Z = 1.
     """
     total = float(motion[-1]) if len(motion) else 0.0
     if total == 0.0:
@@ -172,11 +175,12 @@ def cut_into_bins(motion: ArrayF64, frames_per_bin: int) -> Bins:  # [N] cumulat
     count = max(1, round(len(motion) / frames_per_bin))
     position = count * motion / total
     index = np.minimum(np.floor(position), count - 1).astype(np.int32)
-    centrality = np.clip(1.0 - np.abs(2.0 * (position - index) - 1.0), 0.0, 1.0)  # rounding at the borders
+    # The clip removes rounding errors at the borders.
+    centrality = np.clip(1.0 - np.abs(2.0 * (position - index) - 1.0), 0.0, 1.0)
     return Bins(index, centrality, total * np.arange(count + 1) / count)
 
 
 def _row_blocks(n_rows: int, n_columns: int) -> list[npt.NDArray[np.intp]]:
-    """Consecutive rows, so many at a time that a block with ``n_columns`` columns stays small."""
+    """Return blocks of consecutive rows with at most `_PAIRS_AT_ONCE` elements in ``n_columns`` columns."""
     step = max(1, _PAIRS_AT_ONCE // max(1, n_columns))
     return [np.arange(start, min(start + step, n_rows)) for start in range(0, n_rows, step)]

@@ -1,9 +1,7 @@
 """Schemas of the RVA tables.
 
-Both tables speak of the training frames only: held-out frames (split ``test``) enter no RVA set and have no
-row. Rows stand in trajectory order, by ``frame_id``. The columns of ``FRAMES`` are those of the interface, in
-its order, and two more at the end: ``stand_in``, which says that no frame was reliable and which frames took
-that place, and ``reactivated_for``.
+Both tables contain training frames only, since held-out frames (split ``test``) belong to no set of RVA. Rows
+are in trajectory order, by ``frame_id``.
 """
 
 from __future__ import annotations
@@ -25,18 +23,18 @@ def _score(name: str, meaning: str, *, nullable: bool = False) -> pa.Field:
 
 
 def _appearance(name: str, meaning: str) -> pa.Field:
-    return _score(name, f"{meaning}; null when the frame could not be scored", nullable=True)
+    return _score(name, f"{meaning}; null if the frame could not be scored", nullable=True)
 
 
 def _geometry(name: str, meaning: str) -> pa.Field:
-    return _score(name, f"{meaning}; null when the frame is not registered or not scored", nullable=True)
+    return _score(name, f"{meaning}; null if the frame is not registered or not scored", nullable=True)
 
 
 FRAMES = pa.schema(
     [
         column("frame_id", pa.int32(), "id of the frame in ingest/frames; orders the trajectory"),
         column("name", pa.string(), "name of the frame in the capture"),
-        column("evaluator", pa.string(), "who judged the appearance: name-version, with the model's name"),
+        column("evaluator", pa.string(), "evaluator of the appearance: name-version, with the model's name"),
         *(_appearance(f"r_{name}", f"quality cue {name.replace('_', ' ')}, 1 is best") for name in R_CUES),
         *(
             _appearance(f"b_{name}", f"degradation cue {name.replace('_', ' ')}, 1 is worst")
@@ -49,21 +47,21 @@ FRAMES = pa.schema(
         _geometry("D", "pose diversity: largest pose distance to another reliable frame"),
         _geometry("O", "visibility redundancy: largest overlap (IoU of points) with another reliable frame"),
         _geometry("G", "geometric utility, clip(alpha C + beta D - eta O)"),
-        column("bin", pa.int32(), "trajectory bin, from 0; null when C is", nullable=True),
+        column("bin", pa.int32(), "trajectory bin, from 0; null if C is null", nullable=True),
         _geometry("Z", "centrality in the bin, 1 at its middle"),
         column("role", pa.string(), "strong, geometric, auxiliary, reactivated or suppressed"),
-        _score("weight", "weight of the frame's raw supervision; 0: the frame is never loaded"),
+        _score("weight", "weight of the frame's raw supervision; 0: the frame is not used"),
         column(
             "stand_in",
             pa.bool_(),
-            "no frame is reliable and this one is among the best by R - B that stand in for the set A "
-            "in C, D and O (roles do not change)",
+            "no frame is reliable, and this one is among the best by R - B that replace the set A in C, D "
+            "and O (roles do not change)",
         ),
         column(
             "reactivated_for",
             pa.string(),
-            "why a suppressed frame is active after all: coverage (its bin had none) or active_share (the "
-            "capture had too few); null for any other",
+            "reason to reactivate a suppressed frame: coverage (no active frame in its bin) or active_share "
+            "(too few in the capture); null for other frames",
             nullable=True,
         ),
     ]
@@ -75,8 +73,8 @@ BINS = pa.schema(
         column("s_start", pa.float64(), "cumulative pose motion at which the bin starts"),
         column("s_end", pa.float64(), "cumulative pose motion at which the bin ends"),
         column("n_frames", pa.int32(), "registered training frames in the bin"),
-        column("n_active", pa.int32(), "of these, with a weight above 0, reactivation included"),
-        column("covered", pa.bool_(), "had an active frame before reactivation"),
+        column("n_active", pa.int32(), "those with a weight above 0, including reactivated frames"),
+        column("covered", pa.bool_(), "the bin had an active frame before reactivation"),
         column("reactivated", pa.list_(pa.int32()), "frame_id of the reactivated frames, in ascending order"),
     ]
 )

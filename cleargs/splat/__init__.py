@@ -1,6 +1,6 @@
-"""The Gaussian splatting core that every stage shares: cameras, Gaussians, rendering, losses, optimiser.
+"""Gaussian splatting for all stages: cameras, Gaussians, rendering, losses and the optimiser.
 
-Nothing heavy is imported here, and Numba only where a CPU kernel is first needed. Start with
-:func:`cleargs.splat.render.render` for a differentiable picture and with
-:class:`cleargs.splat.kernels.rasteriser.Rasteriser` for training.
+Importing this package is fast. Numba is imported when a CPU kernel is first needed. Start with
+`cleargs.splat.render.render` for a differentiable image, and with
+`cleargs.splat.kernels.rasteriser.Rasteriser` for training.
 """

@@ -1,4 +1,4 @@
-"""What a training is expected to take, from its settings and its views."""
+"""Expected cost of a training, from its settings and views."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from cleargs.splat.config import TrainConfig
 if TYPE_CHECKING:
     from cleargs.splat.views import TrainingView
 
-# Wall seconds of a step on two quiet cores: fixed, a megapixel, a Gaussian.
+# Wall seconds on two idle cores of the reference machine (`cleargs.splat.pace`): per step, constant and by
+# size, ...
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
-# And a megapixel of a frame that is asked what its camera did: the first time, and again.
+# ... and per megapixel for the estimate of a frame's image formation: the first one, and later ones.
 SEARCH_S, SEARCH_AGAIN_S = 4.0, 1.0
 
 Settings = TypeVar("Settings", bound=TrainConfig)
 
 
 def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
-    """How many Gaussians each step has, [length], where they grow from ``start`` as fast as they may."""
+    """Return the number of Gaussians at each step, [length], with maximum growth from ``start``."""
     first, planned = config.first, config.planned
     counts = np.full(config.length, float(start))
     if not config.densify or config.budget is None or start >= config.budget:
@@ -35,9 +36,16 @@ def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
 
 
 def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: int) -> NDArray[np.float64]:
-    """Rough wall seconds of each step on two quiet cores, [length]: steps late in a training take longer.
+    """Estimate the wall seconds of each step on two idle cores.
 
-    ``config`` is decided; ``frames`` of ``megapixels`` each are trained on, from ``start`` Gaussians.
+    Args:
+        config: Settings with steps and budget (`resolve_config`).
+        frames: Number of training frames.
+        megapixels: Megapixels per frame.
+        start: Number of Gaussians at the start.
+
+    Returns:
+        Seconds, [length]. Later steps take longer, as the number of Gaussians grows.
     """
     step = config.first + np.arange(config.length)
     reduced = np.where(step < config.coarse_share * config.planned, config.coarse_factor**2, 1.0)
@@ -53,8 +61,16 @@ def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: 
 def training_cost(
     config: TrainConfig, frames: int, megapixels: float, start: int | None = None
 ) -> tuple[float, float]:
-    """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames from
-    ``start`` Gaussians (None: from as many as it may have).
+    """Estimate time and memory of a training.
+
+    Args:
+        config: Settings; open steps and budget are set as in `resolve_config`.
+        frames: Number of training frames.
+        megapixels: Megapixels per frame.
+        start: Number of Gaussians at the start (None: the maximum number).
+
+    Returns:
+        Wall seconds on two idle cores, and GB of memory without the images.
     """
     pixels = round(frames * megapixels * 1e6)
     budget = config.budget_for(pixels)
@@ -64,7 +80,7 @@ def training_cost(
 
 
 def resolve_config(config: Settings, views: Sequence[TrainingView]) -> Settings:
-    """``config`` with the steps and the budget that it leaves open, for these views."""
+    """Return ``config`` with steps and budget set; open ones follow from the views (see `TrainConfig`)."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
     update = {"steps": config.steps_for(len(views)), "budget": config.budget_for(pixels)}
     return config.model_copy(update=update)

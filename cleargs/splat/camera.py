@@ -17,11 +17,11 @@ from cleargs.types import ArrayF64
 class Camera:
     """An undistorted pinhole camera.
 
-    Sizes, focal lengths and the principal point are in pixels; pixel centres lie at + 0.5.
+    Sizes, focal lengths and the principal point are in pixels; pixel centres are at + 0.5.
     ``world_to_camera`` is a rigid [4, 4] float64 matrix with OpenCV axes (x right, y down, z forward).
 
     Raises:
-        InputError: when a size or focal length is not positive or a number is not finite.
+        InputError: A size or focal length is not positive, or a number is not finite.
     """
 
     width: int
@@ -41,7 +41,7 @@ class Camera:
         if self.width < 1 or self.height < 1 or not (np.isfinite(numbers).all() and np.isfinite(pose).all()):
             raise InputError(
                 f"the camera is not usable: {self.width}x{self.height}, fx fy cx cy = {numbers}",
-                hint="sizes must be positive and every number finite",
+                hint="give positive sizes and finite numbers",
             )
         if self.fx <= 0 or self.fy <= 0:
             raise InputError(
@@ -57,7 +57,7 @@ class Camera:
         return centre
 
     def resized(self, width: int, height: int) -> Camera:
-        """The camera of the same view resampled to ``width`` x ``height`` pixels."""
+        """Return this camera for images resampled to ``width`` x ``height`` pixels."""
         x, y = width / self.width, height / self.height
         return replace(
             self,
@@ -70,18 +70,24 @@ class Camera:
         )
 
     def scaled(self, factor: float) -> Camera:
-        """The camera of the view resampled by ``factor``, its size rounded to whole pixels (at least 1)."""
+        """Return this camera for images resampled by ``factor``, its sides rounded to pixels (at least 1)."""
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
 
-def look_at(place: ArrayF64, target: ArrayF64, up: ArrayF64) -> ArrayF64:  # [4, 4] world to camera
-    """A camera at ``place`` whose axis goes through ``target``, without roll. OpenCV axes."""
-    forward = (target - place) / np.linalg.norm(target - place)
+def look_at(position: ArrayF64, target: ArrayF64, up: ArrayF64) -> ArrayF64:  # [4, 4] world to camera
+    """Return the pose of a camera without roll (OpenCV axes).
+
+    Args:
+        position: Position of the camera, [3].
+        target: Point on the optical axis, [3].
+        up: Direction that is up in the image, [3].
+    """
+    forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, up)
     right /= max(float(np.linalg.norm(right)), 1e-12)
     pose = np.eye(4)
     pose[:3, :3] = [right, np.cross(forward, right), forward]
-    pose[:3, 3] = -pose[:3, :3] @ place
+    pose[:3, 3] = -pose[:3, :3] @ position
     return pose
 
 
@@ -92,9 +98,16 @@ def cameras_json(
     rotation: npt.NDArray[np.float64] | None = None,  # [3, 3]
     translation: npt.NDArray[np.float64] | None = None,  # [3]
 ) -> list[dict[str, Any]]:
-    """``cameras.json`` in the layout of the Inria code, which viewers import next to a PLY.
+    """Return the content of ``cameras.json`` of the Inria code, which viewers read next to a PLY.
 
-    One entry per named camera, moved by x -> scale rotation x + translation: its centre, camera to world.
+    Args:
+        cameras: Names and cameras.
+        scale: Scale of the similarity x -> scale rotation x + translation that is applied to the cameras.
+        rotation: Its rotation (None: identity).
+        translation: Its translation (None: zero).
+
+    Returns:
+        One entry per camera, with its centre and its rotation from camera to world.
     """
     turn = np.eye(3) if rotation is None else rotation
     shift = np.zeros(3) if translation is None else translation

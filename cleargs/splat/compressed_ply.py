@@ -1,9 +1,15 @@
-"""``.compressed.ply``, PlayCanvas's quantised PLY: 16 bytes a Gaussian, and one a spherical-harmonics number.
+"""``.compressed.ply``, the quantised PLY of PlayCanvas: 16 bytes per Gaussian, and one per SH coefficient.
 
-Gaussians stand in chunks of 256. A chunk keeps the range of its positions, log scales and colours in float32;
-a Gaussian keeps where in these ranges it lies (11, 10 and 11 bits; colours 8), the three smaller numbers of
-its quaternion (10 bits each, and 2 that say which was left out) and its opacity (8 bits). Numbers of the
-spherical harmonics above degree 0 are 8 bits from -4 to 4. Source: the writer of splat-transform.
+Gaussians are grouped in chunks of 256. A chunk stores the ranges of its positions, log scales and colours in
+float32. A Gaussian stores:
+
+- its position and log scale relative to these ranges (11, 10 and 11 bits), and its colour (8 bits per
+  channel);
+- the three smaller components of its quaternion (10 bits each) and the index of the largest (2 bits);
+- its opacity (8 bits).
+
+Coefficients of the spherical harmonics above degree 0 have 8 bits for -4 to 4. Source: the writer of
+splat-transform.
 """
 
 from __future__ import annotations
@@ -19,12 +25,12 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
 CHUNK = 256
-"""Gaussians that share their ranges."""
+"""Number of Gaussians per chunk."""
 
 LOG_SCALE_MAX = 20.0
-"""Log scales beyond this would spoil the range of the others."""
+"""Limit of log scales; outliers would make the range of the others too coarse."""
 
-_MORTON_BITS = 21  # a coordinate; three of them fit into 63 bits
+_MORTON_BITS = 21  # per coordinate; three fit into 63 bits
 _RANGES = [
     f"{end}_{name}"
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
@@ -35,7 +41,7 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def compressed_ply(scene: Scene) -> bytes:
-    """The bytes of ``scene``; equal scenes give equal bytes. Gaussians come out in Morton order."""
+    """Encode a scene, with its Gaussians in Morton order; equal scenes give equal bytes."""
     gaussians = scene.gaussians.to("cpu").detach()
     order = morton_order(gaussians.means.numpy())
     gaussians = gaussians.select(torch.from_numpy(order))
@@ -66,7 +72,7 @@ def compressed_ply(scene: Scene) -> bytes:
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:  # [N, 3] -> [N]
-    """The order along a Z-curve, in which neighbours in a file are neighbours in space."""
+    """Return the order along a Z-order curve, in which neighbours in the file are near in space."""
     if len(means) == 0:
         return np.zeros(0, np.int64)
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
@@ -87,22 +93,22 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:  # [N, 3] -> 
 
 
 def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Ranges [chunks, 18] and packed Gaussians [N, 4]. The last chunk is filled with its last Gaussian."""
+    """Return ranges [chunks, 18] and packed Gaussians [N, 4]. The last Gaussian fills up the last chunk."""
     count = gaussians.num
     chunks = -(-count // CHUNK)
     rows = np.minimum(np.arange(chunks * CHUNK), max(count - 1, 0))
     colours = gaussians.sh.numpy()[:, 0] * np.float32(SH_C0) + np.float32(0.5)
     scales = gaussians.log_scales.numpy().clip(-LOG_SCALE_MAX, LOG_SCALE_MAX)
-    ranges, places = [], []
+    ranges, relative = [], []
     for values in (gaussians.means.numpy(), scales, colours):
         chunked = values[rows].reshape(chunks, CHUNK, 3)
         low, high = chunked.min(axis=1), chunked.max(axis=1)
         ranges += [low, high]
         width = np.where(high > low, high - low, 1.0)[:, None]
-        places.append(((chunked - low[:, None]) / width).reshape(-1, 3)[:count])
-    position, scale, colour = places
+        relative.append(((chunked - low[:, None]) / width).reshape(-1, 3)[:count])
+    position, scale, colour = relative
     alpha = torch.sigmoid(gaussians.logit_opacities).numpy()
-    largest, smaller = smaller_parts(gaussians.rotations.numpy())
+    largest, smaller = smallest_three(gaussians.rotations.numpy())
     rotation = _pack((smaller * np.sqrt(0.5) + 0.5).astype(np.float32), (10, 10, 10))
     packed = [
         _pack(position, (11, 10, 11)),
@@ -114,7 +120,7 @@ def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint3
 
 
 def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint32]:  # [N, K] -> [N]
-    """K numbers in [0, 1] in so many bits each, the first in the highest."""
+    """Pack K numbers in [0, 1] with ``bits`` bits each into one integer, the first in the highest bits."""
     packed = np.zeros(len(values), np.uint32)
     for column, width in enumerate(bits):
         top = 2**width - 1
@@ -123,11 +129,14 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
     return packed
 
 
-def smaller_parts(
+def smallest_three(
     quaternions: NDArray[np.floating[Any]],  # [N, 4]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Which part of each unit quaternion is largest [N], and the others in their order [N, 3], with the sign
-    that makes the largest positive: all that is needed to find it again.
+    """Return three components of each quaternion, from which a decoder can compute the fourth.
+
+    Returns:
+        Index of the largest component [N], and the other components of the normalised quaternion in their
+        order [N, 3]. Their signs are those for which the largest component is positive.
     """
     unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)

@@ -1,4 +1,4 @@
-"""How a scene is trained."""
+"""Settings of a training, and the default numbers of steps and Gaussians."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pydantic import Field, model_validator
 
 from cleargs.base_model import Inherited, Settings
 
-# Steps and Gaussians where the settings leave them open. Neither is one number for all captures. Steps follow
-# the frames, since each is to be seen often enough; Gaussians follow the pixels, since they have that much to
-# say. `quality` scales both. docs/speed.md has what each step up costs and brings.
+# Numbers of steps and Gaussians if the settings leave them unset (measured in docs/experiments/training.md).
+# Steps follow the number of frames, so that each frame is seen often enough. Gaussians follow the number of
+# pixels, the information in a capture. `quality` scales both; docs/speed.md lists its cost and gain.
 Quality = Literal["draft", "standard", "high"]
 
 STEPS_PER_FRAME = 50
@@ -23,129 +23,132 @@ MIN_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
 INIT_SCALE = 0.5
-"""Starting scale of a Gaussian per distance to its neighbours (docs/experiments/training.md)."""
+"""Initial scale of a Gaussian, relative to the distance of its neighbours (docs/experiments/training.md)."""
 INIT_OPACITY = 0.5
-"""Starting opacity of a Gaussian (3DGS-MCMC)."""
+"""Initial opacity of a Gaussian (3DGS-MCMC)."""
 
 
 def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
-    """Steps of the first scene of a capture with so many active frames."""
+    """Return the number of steps of G0 for this number of active frames."""
     return round(STEPS_FACTOR[quality] * min(max(STEPS_PER_FRAME * frames, MIN_STEPS), MAX_STEPS))
 
 
 def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
-    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all.
+    """Return the maximum number of Gaussians for a capture.
 
-    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames),
-    40,000 at least, since fewer cost a small capture a dB, and ``max_budget`` at most: all times the
-    quality's factor.
+    It is one Gaussian (59 numbers at SH degree 3) per 160 pixels (480 numbers, most seen by several frames),
+    times the factor of the quality. Fewer than 40,000 reduce the PSNR of small captures by 1 dB.
+
+    Args:
+        pixels: Number of pixels in all active frames.
+        max_budget: Upper limit at standard quality.
+        quality: Quality of the run.
     """
     standard = min(max(pixels // PIXELS_PER_GAUSSIAN, MIN_BUDGET), max_budget)
     return max(1, int(BUDGET_FACTOR[quality] * standard))
 
 
 class FormationConfig(Settings):
-    """What the camera did to each raw frame, found during the training and put into its loss."""
+    """Settings of image formation, which is estimated per raw frame during the training."""
 
     enabled: bool = Field(
         True,
-        description="compare raw frames with the render as their camera saw it: blurred by its motion, "
-        "skewed by its rolling shutter, out of focus",
+        description="compare each raw frame with the render after image formation: motion blur, rolling "
+        "shutter, defocus",
     )
     start: float = Field(
-        0.25, ge=0, le=1, description="share of the schedule before formations are first estimated"
+        0.25, ge=0, le=1, description="fraction of the schedule before image formation is first estimated"
     )
     every: int = Field(
-        10, ge=1, description="a frame's formation is estimated again after so many steps on it"
+        10, ge=1, description="training steps on a frame between two estimates of its image formation"
     )
-    pose: bool = Field(False, description="correct the pose of a frame along with its motion")
+    pose: bool = Field(False, description="correct the pose of a frame together with its motion")
     unexplained: float = Field(
         0.0,
         ge=0,
         le=1,
-        description="difference of colour (sRGB, mean of a neighbourhood; 0.05, say) beyond which pixels "
-        "that stay unexplained count less: for captures with people or things that move; 0: never",
+        description="difference of colour (sRGB, mean of a neighbourhood, e.g. 0.05) above which unexplained "
+        "pixels count less, for captures with moving people or objects; 0 = off",
     )
 
     accept: ClassVar[float] = 0.02
-    """Share of a frame's misfit that a model must explain to be taken (docs/experiments/formation.md)."""
+    """Share of a frame's misfit that a model must explain to be accepted (docs/experiments/formation.md)."""
     trust: ClassVar[float] = 1.0
-    """Power of the share that an explained frame keeps of its weight: in proportion to its misfit."""
+    """Exponent p in the weight of an explained frame, max(w_RVA, min(1, median misfit / misfit)^p)."""
 
 
 class TrainConfig(Settings):
-    """How a scene is optimised.
+    """Settings of the optimisation of a scene.
 
-    The trainings of a run follow one schedule (image sizes, growth, SH degree, rates), each in its part from
-    ``begin`` to ``end``: G0, RIVR's rounds, the consolidation. All of its numbers are shares of the whole.
+    All trainings of a run (G0, the rounds of RIVR, the consolidation) share one schedule of image sizes,
+    growth, SH degree and rates. Each training covers the part from ``begin`` to ``end``. Times in the
+    schedule are fractions of the whole.
 
-    Rates hold for 30,000 steps; a shorter schedule learns faster by ``rate_factor``. They are those of 3DGS
-    and gsplat but for scales and opacities, which get twice theirs, the means, which get 2.5 times theirs
-    (their noise is gsplat's at 3,200 steps), and the SH terms above the constant, which get four times
-    theirs.
-    docs/experiments/training.md has what that is worth.
+    Rates are for 30,000 steps. A shorter schedule multiplies them by ``rate_factor``. They are those of 3DGS
+    and gsplat, except: scales and opacities have twice the rate, means 2.5 times, and SH terms above the
+    constant four times. The noise on the means equals gsplat's at 3,200 steps. Source of these factors:
+    docs/experiments/training.md.
     """
 
     RETIRED: ClassVar[Mapping[str, Any]] = {"strategy": "mcmc", "adaptive": Inherited("g0", strictly=False)}
 
     quality: Quality = Field(
         "standard",
-        description="what is spent where steps and budget are unset: draft a quarter of the steps and half "
-        "of the Gaussians of standard, high four times and twice",
+        description="size of all trainings if steps and budget are unset: draft has a quarter of the steps "
+        "and half of the Gaussians of standard, high has 4 times the steps and twice the Gaussians",
     )
     steps: int | None = Field(
         None,
         ge=1,
         le=1_000_000,
-        description="optimisation steps, one view each; unset = 50 an active frame, 3,200 to 7,200, times "
-        "what quality says",
+        description="optimisation steps, one view each; unset = 50 per active frame, 3,200 to 7,200, times "
+        "the factor of the quality",
     )
-    begin: float = Field(
-        0.0, ge=0, lt=1, description="share of the schedule that lies behind when this training begins"
-    )
+    begin: float = Field(0.0, ge=0, lt=1, description="start of this training in the schedule, as a fraction")
     end: float = Field(
         1.0,
         gt=0,
         le=1,
-        description="share of the schedule that lies behind when this training ends",
+        description="end of this training in the schedule, as a fraction",
     )
-    ssim_lambda: float = Field(0.2, ge=0, le=1, description="share of D-SSIM in the loss, the rest is L1")
+    ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")
     coarse_share: float = Field(
         0.25,
         ge=0,
         le=1,
-        description="share of the schedule, its first, with reduced images; 0 = off",
+        description="fraction of the schedule, at its start, with reduced images; 0 = off",
     )
 
-    densify: bool = Field(True, description="let the strategy change the number and places of the Gaussians")
+    densify: bool = Field(True, description="split, move and add Gaussians during the training")
     budget: int | None = Field(
         None,
         ge=1,
         le=20_000_000,
-        description="most Gaussians, from the first step on; unset = growth ends at a number from the pixels",
+        description="maximum number of Gaussians, also at the start; unset = growth stops at a number that "
+        "follows from the pixels",
     )
     max_budget: int = Field(
         400_000,
         ge=1,
         le=20_000_000,
-        description="most Gaussians where budget is unset, before the quality's factor",
+        description="maximum number of Gaussians if budget is unset, before the factor of the quality",
     )
     refine_every: float = Field(
-        1 / 64, gt=0, le=1, description="share of the schedule between refinements; one step at least"
+        1 / 64, gt=0, le=1, description="fraction of the schedule between refinements (at least one step)"
     )
     refine_start: float = Field(
-        0.05, ge=0, le=1, description="share of the schedule before the first refinement"
+        0.05, ge=0, le=1, description="fraction of the schedule before the first refinement"
     )
     refine_stop: float = Field(
-        0.8, ge=0, le=1, description="share of the schedule after which nothing is refined"
+        0.8, ge=0, le=1, description="fraction of the schedule after which refinements stop"
     )
     noise: float = Field(
-        6.5e4, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5 on 1.6e-4)"
+        6.5e4, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5 with 1.6e-4)"
     )
     opacity_reg: float = Field(
-        0.005, ge=0, description="factor on the mean opacity in the loss (3DGS-MCMC: 0.01)"
+        0.005, ge=0, description="weight of the mean opacity in the loss (3DGS-MCMC: 0.01)"
     )
-    scale_reg: float = Field(0.01, ge=0, description="factor on the mean scale in the loss")
+    scale_reg: float = Field(0.01, ge=0, description="weight of the mean scale in the loss")
 
     lr_means: float = Field(4e-4, ge=0, description="rate of the means at the first step (3DGS: 1.6e-4)")
     rate_factor: float | None = Field(
@@ -156,7 +159,7 @@ class TrainConfig(Settings):
         "the whole schedule), 1 to 6",
     )
     lr_final: float = Field(
-        0.1, gt=0, le=1, description="share of all other rates left at the last step, exponential decay"
+        0.1, gt=0, le=1, description="factor on all other rates at the last step, by exponential decay"
     )
     lr_scales: float = Field(1e-2, ge=0, description="rate of the log scales (3DGS: 5e-3)")
     lr_rotations: float = Field(1e-3, ge=0, description="rate of the quaternions")
@@ -166,59 +169,63 @@ class TrainConfig(Settings):
         5 / 32,
         ge=0,
         le=1,
-        description="share of the schedule between raises of the SH degree from 0 up; 0 = all degrees from "
-        "the first step",
+        description="fraction of the schedule after which the SH degree, from 0, rises by one; 0 = all "
+        "degrees from the first step",
     )
 
-    formation: FormationConfig = Field(FormationConfig(), description="what the camera did to each raw frame")
+    formation: FormationConfig = Field(FormationConfig(), description="image formation of each raw frame")
 
     checkpoint_interval: int = Field(
         200,
         ge=1,
-        description="steps between checkpoints; changes no result",
+        description="steps between checkpoints; does not change results",
         json_schema_extra={"key": False},
     )
     cache_mb: int = Field(
         1024,
         ge=0,
-        description="memory for decoded images, MiB; changes no result",
+        description="memory for decoded images, MiB; does not change results",
         json_schema_extra={"key": False},
     )
 
     coarse_factor: ClassVar[float] = 0.5
     """Factor on width and height of reduced images."""
     growth: ClassVar[float] = 0.05
-    """Most new Gaussians per refinement, as a share of those there (3DGS-MCMC)."""
+    """Maximum growth per refinement, as a fraction of the number of Gaussians (3DGS-MCMC)."""
     min_opacity: ClassVar[float] = 0.005
-    """Opacity at or below which a Gaussian is dead (3DGS)."""
+    """Opacity up to which a Gaussian is dead (3DGS)."""
     lr_means_final: ClassVar[float] = 0.01
-    """Share of ``lr_means`` left at the last step, exponential decay (3DGS)."""
+    """Factor on ``lr_means`` at the last step, by exponential decay (3DGS)."""
     lr_exposure: ClassVar[float] = 1e-3
-    """Rate of the exposure affines, where they are on (the last one of 3DGS)."""
+    """Rate of exposure compensation, if it is on (the final rate of 3DGS)."""
 
     def steps_for(self, frames: int) -> int:
-        """Steps of a training of so many active frames."""
+        """Return the number of steps of a training on this number of active frames."""
         return self.steps or steps_from_frames(frames, self.quality)
 
     def budget_for(self, pixels: int) -> int:
-        """Most Gaussians of a training whose active frames hold so many pixels in all."""
+        """Return the maximum number of Gaussians for active frames with ``pixels`` pixels in total."""
         return self.budget or budget_from_pixels(pixels, self.max_budget, self.quality)
 
     @property
     def length(self) -> int:
-        """The steps; raises ValueError while they are not decided (`cleargs.splat.budget.resolve_config`)."""
+        """Number of steps of this training.
+
+        Raises:
+            ValueError: The number is open; `cleargs.splat.budget.resolve_config` sets it.
+        """
         if self.steps is None:
-            raise ValueError("the steps of this training are not decided yet")
+            raise ValueError("the number of steps is not set yet")
         return self.steps
 
     @property
     def planned(self) -> int:
-        """Steps of the whole schedule, of which this training has its part."""
+        """Number of steps of the whole schedule."""
         return round(self.length / (self.end - self.begin))
 
     @property
     def first(self) -> int:
-        """The step of the schedule that it begins with."""
+        """First step of this training in the schedule."""
         return round(self.begin * self.planned)
 
     @property
@@ -229,5 +236,5 @@ class TrainConfig(Settings):
     @model_validator(mode="after")
     def _ends_after_its_begin(self) -> TrainConfig:
         if self.begin >= self.end:
-            raise ValueError(f"the schedule cannot end at {self.end} where it begins at {self.begin}")
+            raise ValueError(f"end is {self.end}, but it must be greater than begin, {self.begin}")
         return self

@@ -1,15 +1,17 @@
-"""Densification after "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
+"""Densification based on "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
 
-As there, dead Gaussians move, the number grows to a hard budget, and noise that only transparent Gaussians
-feel is added to the means. But the error says where, not opacity: what takes part in pixels that are far from
-their frames (Rota Bulò et al., "Revising densification in Gaussian splatting", 2024) is cut in two along its
-longest axis (Deng et al., "Efficient density control", 2024); the dead become halves, as the new ones are.
-Drawn by opacity, copies at one place take long to part, and what lies in the dark or behind the sparse points
-gets none.
+As in that paper, dead Gaussians are relocated, the number of Gaussians grows to a hard budget, and each step
+adds noise to the means of transparent Gaussians. Two rules differ:
 
-Here are the rules of a refinement: pure functions on numpy arrays, on one thread, so that the results depend
-on no thread count. The noise, of every step, is a kernel. A GPU has the same rules, and draws other random
-numbers.
+- Gaussians are drawn by their error, not by their opacity: by their contribution to the squared error of the
+  frames (Rota Bulò et al., "Revising densification in Gaussian splatting", 2024). Draws by opacity add
+  nothing in dark regions and behind the sparse points.
+- A drawn Gaussian is split along its longest axis (Deng et al., "Efficient density control", 2024). Two
+  copies at the same place would need many steps to separate.
+
+This module has the rules of a refinement on the CPU, as pure functions on numpy arrays. They run on one
+thread, so that results do not depend on the number of threads. The noise is a kernel
+(`Backend.add_position_noise`). A GPU applies the same rules with different random numbers.
 """
 
 from __future__ import annotations
@@ -25,15 +27,15 @@ from cleargs.types import AnyArray, ArrayF32, ArrayF64
 Arrays = dict[str, ArrayF32]
 
 NOISE_CUT = 0.15
-"""Opacity above which the noise factor is under 1e-6, and is left out."""
+"""Opacity above which the noise is skipped: its factor is below 1e-6."""
 
 ROUNDS = 4
-"""Rounds of a refinement, each with its share of the growth: a Gaussian with much of the error, such as a
-smear over half of a frame, is cut into up to sixteen."""
+"""Number of rounds per refinement, each with an equal part of the growth. A Gaussian with a large error, such
+as a smear over half of a frame, is split into up to 16."""
 
 SPLIT_FRACTION = 0.7
-"""How far the halves of a Gaussian lie from its middle, and their scale, as shares of its scale along its
-longest axis: together they spread about as far (0.7² + 0.7² = 0.98)."""
+"""Offset of the two halves from the centre, and their scale, relative to the scale of the split Gaussian
+along its longest axis. The variance is almost preserved: 0.7² + 0.7² = 0.98."""
 
 
 def refine(
@@ -46,39 +48,49 @@ def refine(
     min_opacity: float,
     rng: np.random.Generator,
 ) -> tuple[Arrays, list[Arrays]]:
-    """Cut live Gaussians in two, drawn in proportion to ``errors``, in `ROUNDS` rounds. The other halves take
-    the places of the dead, and new ones: at most a share ``rate``, never beyond ``budget``.
+    """Split live Gaussians, drawn in proportion to their errors, in `ROUNDS` rounds.
 
-    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which
-    become 0 for both halves. Returns new ones; those given are changed and must not be used again.
+    The first half stays in place. The second half replaces a dead Gaussian, or is appended.
+
+    Args:
+        arrays: Parameters by name, first axis N. They are changed and must not be used again.
+        moments: Running means of the optimiser; 0 for both halves after a split. They are changed, too.
+        errors: Error of each Gaussian.
+        rate: Maximum growth, as a fraction of N.
+        budget: Maximum number of Gaussians after the growth.
+        min_opacity: Opacity up to which a Gaussian is dead.
+        rng: Source of the draws.
+
+    Returns:
+        The new parameters and moments.
     """
     running, start = list(moments), len(errors)
     growth = max(0, min(budget, int((1.0 + rate) * start)) - start)
     for done in range(1, ROUNDS + 1):
         opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
-        alive = opacity > min_opacity  # not so is NaN
+        alive = opacity > min_opacity  # False for NaN
         weights, dead = np.where(alive, errors, 0.0), np.flatnonzero(~alive)
         count = len(opacity)
         room = max(0, start + growth * done // ROUNDS - count)
-        cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng)
-        others = _halves(arrays, cut, opacity[cut], min_opacity)
-        errors = np.concatenate([errors, np.zeros(max(0, len(cut) - len(dead)))])
-        places = np.concatenate([dead, np.arange(count, len(errors))])[: len(cut)]
-        errors[cut] /= 2
-        errors[places] = errors[cut]
-        arrays = {name: _placed(array, places, others[name]) for name, array in arrays.items()}
+        chosen = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng)
+        others = _split(arrays, chosen, opacity[chosen], min_opacity)
+        errors = np.concatenate([errors, np.zeros(max(0, len(chosen) - len(dead)))])
+        places = np.concatenate([dead, np.arange(count, len(errors))])[: len(chosen)]
+        errors[chosen] /= 2
+        errors[places] = errors[chosen]
+        arrays = {name: _write_rows(array, places, others[name]) for name, array in arrays.items()}
         for moment in running:
             for array in moment.values():
-                array[cut] = 0
+                array[chosen] = 0
         running = [
-            {name: _placed(array, places, np.zeros_like(others[name])) for name, array in moment.items()}
+            {name: _write_rows(array, places, np.zeros_like(others[name])) for name, array in moment.items()}
             for moment in running
         ]
     return arrays, running
 
 
-def _placed(array: ArrayF32, places: NDArray[np.int64], rows: ArrayF32) -> ArrayF32:
-    """``array`` with ``rows`` at ``places``, made longer where these lie behind its end."""
+def _write_rows(array: ArrayF32, places: NDArray[np.int64], rows: ArrayF32) -> ArrayF32:
+    """Write ``rows`` at ``places`` of ``array``, extended if places are beyond its end."""
     longer = max(len(array), 1 + int(places.max(initial=-1)))
     if longer > len(array):
         array = np.concatenate([array, np.zeros((longer - len(array), *array.shape[1:]), array.dtype)])
@@ -87,9 +99,10 @@ def _placed(array: ArrayF32, places: NDArray[np.int64], rows: ArrayF32) -> Array
 
 
 def sample_once(weights: ArrayF64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """``count`` different indices, in proportion to ``weights`` [N] >= 0, of which as many are above 0.
+    """Draw indices without replacement, in proportion to ``weights`` [N] >= 0.
 
-    Efraimidis and Spirakis, "Weighted random sampling with a reservoir" (2006).
+    At least ``count`` weights must be positive. Source: Efraimidis and Spirakis, "Weighted random sampling
+    with a reservoir" (2006).
     """
     with np.errstate(divide="ignore"):
         keys = rng.standard_exponential(len(weights)) / weights
@@ -97,25 +110,25 @@ def sample_once(weights: ArrayF64, count: int, rng: np.random.Generator) -> NDAr
     return first
 
 
-def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: ArrayF64, min_opacity: float) -> Arrays:
-    """Make the Gaussians ``cut`` one of their halves, in place, and return the other ones.
+def _split(arrays: Arrays, chosen: NDArray[np.int64], opacity: ArrayF64, min_opacity: float) -> Arrays:
+    """Replace the Gaussians ``chosen`` by their first halves in place, and return the second halves.
 
-    The opacity is such that the optical depth, summed along the axis, stays.
+    The opacity of the halves preserves the optical depth, summed along the axis.
     """
-    longest = arrays["log_scales"][cut].argmax(axis=1)
-    axes = rotation_matrices(arrays["rotations"][cut])[np.arange(len(cut)), :, longest]
-    away = axes * (SPLIT_FRACTION * np.exp(arrays["log_scales"][cut, longest]))[:, None]
+    longest = arrays["log_scales"][chosen].argmax(axis=1)
+    axes = rotation_matrices(arrays["rotations"][chosen])[np.arange(len(chosen)), :, longest]
+    away = axes * (SPLIT_FRACTION * np.exp(arrays["log_scales"][chosen, longest]))[:, None]
     faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / SPLIT_FRACTION), min_opacity, 1.0 - 1e-6)
-    arrays["log_scales"][cut, longest] += np.float32(math.log(SPLIT_FRACTION))
-    arrays["logit_opacities"][cut] = np.log(faint) - np.log1p(-faint)
-    others = {name: array[cut] for name, array in arrays.items()}
-    arrays["means"][cut] -= away
+    arrays["log_scales"][chosen, longest] += np.float32(math.log(SPLIT_FRACTION))
+    arrays["logit_opacities"][chosen] = np.log(faint) - np.log1p(-faint)
+    others = {name: array[chosen] for name, array in arrays.items()}
+    arrays["means"][chosen] -= away
     others["means"] += away
     return others
 
 
 def rotation_matrices(quaternions: ArrayF32) -> ArrayF32:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w x y z) of any length; zero: no rotation."""
+    """Return the rotation matrices [N, 3, 3] of quaternions w x y z [N, 4] of any norm (zero: identity)."""
     norm = np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
     w, x, y, z = (quaternions / np.maximum(norm, np.float32(1e-12))).T
     rows = [
@@ -127,6 +140,6 @@ def rotation_matrices(quaternions: ArrayF32) -> ArrayF32:
 
 
 def sigmoid(x: AnyArray) -> AnyArray:
-    """1 / (1 + exp(-x)), in the type of ``x``; the input is kept within +-80, where exp stays finite."""
+    """Return 1 / (1 + exp(-x)) in the type of ``x``, which is clamped to +-80 so that exp stays finite."""
     result: AnyArray = 1 / (1 + np.exp(-np.clip(x, -80, 80)))
     return result

@@ -1,4 +1,4 @@
-"""What a training knows of image formation: `cleargs.formation` fulfils it."""
+"""Interface between a training and image formation. `cleargs.formation` implements it."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from cleargs.splat.types import Render
 from cleargs.splat.views import TrainingView
 
 Renderer = Callable[[Camera], Render]
-"""The scene as trained so far at a camera, with depth."""
+"""Function that renders the current scene with depth."""
 
 
 class Formed(Protocol):
-    """What the camera of one view makes of a sharp render."""
+    """Image formation of one view, in one step of the training."""
 
     camera: Camera
-    """The camera to render: the view's, or a larger one where it shows what moved in from outside."""
+    """Camera to render: that of the view, or one with a margin for pixels that move in from outside."""
     needs_depth: bool
+    """True: `forward` needs the depth of the render."""
     weight: float
-    """The weight of the view: its own, or what it has earned by being explained."""
+    """Weight of the view: the original weight, or more if image formation explains the frame."""
 
     def forward(self, render: Render) -> Tensor:
-        """The photograph [H, W, 3] sRGB."""
+        """Return the observed image [H, W, 3] sRGB of a render."""
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """The gradient by the render's image, from that by the photograph."""
+        """Return the gradient of the render's image, given that of the observed image [H, W, 3]."""
 
     def learn(self) -> None:
-        """Step the numbers that follow the gradient of the last `backward`."""
+        """Update the parameters that follow the gradient of the last `backward`."""
 
 
 class Formation(Protocol):
-    """What the cameras of a capture do to sharp images, found while the scene is trained."""
+    """Image formation of a capture, estimated while the scene is trained."""
 
     def form(
         self,
@@ -46,19 +47,25 @@ class Formation(Protocol):
         mask: Tensor | None,  # [H, W]
         render: Renderer,
     ) -> Formed | None:
-        """For a step on ``view`` reduced by ``factor``, ``progress`` (0 to 1) through the training.
+        """Return the image formation for a step on a view, or None to compare it with the plain render.
 
-        None where the view shows the render as it is.
+        Args:
+            view: View of the step.
+            factor: Scale of the training image in this step.
+            progress: Position in the schedule, 0 to 1.
+            target: Training image at this scale.
+            mask: Pixels that count, or None.
+            render: Function that renders the current scene.
         """
 
     def digest(self) -> str:
-        """A digest of all that it starts from."""
+        """Return a digest of everything it starts from, which identifies its checkpoints."""
 
     def state(self) -> dict[str, Tensor]:
-        """All that changes while it learns, for a checkpoint."""
+        """Return everything that the training changes, for a checkpoint."""
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Resume from what `state` gave."""
+        """Continue from the result of `state`."""
 
     def fault(self) -> str | None:
-        """What in it is not finite; None where all is."""
+        """Return a description of values that are not finite, or None."""

@@ -1,6 +1,6 @@
-"""Scene files for other programs, by their ending.
+"""Scene files for other programs, by file extension.
 
-Each format has axes of its own. Ours are those of COLMAP and of the Inria code's PLYs: y down, z forward.
+Formats differ in their axes. A `Scene` has those of COLMAP and of the Inria PLY: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 
 from cleargs.errors import InputError
 from cleargs.files import atomic_path, write_bytes
-from cleargs.plugins import load_part, plugins
+from cleargs.plugins import load_plugin, plugins
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.glb import glb
@@ -26,13 +26,14 @@ from cleargs.splat.transforms import transform_scene
 
 _AS_IS = (1.0, 1.0, 1.0)
 _ABOUT_X = (1.0, -1.0, -1.0)  # to x right, y up, z back: the axes of SPZ
-_ABOUT_Z = (-1.0, -1.0, 1.0)  # to y up, z still forward: how glTF and PlayCanvas's tools show PLYs
+_ABOUT_Z = (-1.0, -1.0, 1.0)  # to x left, y up, z forward: glTF, and PLYs in the tools of PlayCanvas
 
 
 def write_usd(path: Path, scene: Scene) -> None:
-    """Write OpenUSD's ParticleField3DGaussianSplat (26.03 and later), atomically; y is up in ``scene``.
+    """Write a scene whose y axis is up as ParticleField3DGaussianSplat of OpenUSD, atomically.
 
-    Raises InputError where the extra ``usd`` is not installed.
+    Raises:
+        InputError: OpenUSD 26.03 or later (the extra ``usd``) is not installed.
     """
     try:
         from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
@@ -62,13 +63,14 @@ def write_usd(path: Path, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class Format:
-    """How one kind of file is written."""
+    """A file format that scenes can be written to."""
 
     write: Callable[[Path, Scene], None]
+    """Function that writes a scene, which already has the axes of the format."""
     axes: tuple[float, float, float]
-    """Signs of our axes in the file: half a turn, or none."""
+    """Signs of the axes of a `Scene` in the file: no rotation, or half a turn about one axis."""
     y_up: bool = False
-    """Whether the format allows no other up axis than y."""
+    """True: y is always up in the format."""
 
 
 FORMATS: Mapping[str, Format] = {
@@ -79,43 +81,50 @@ FORMATS: Mapping[str, Format] = {
     "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z, y_up=True),
     "usdc": Format(write_usd, _ABOUT_Z, y_up=True),
 }
-"""Ending -> format; a longer ending stands before the one that it ends with."""
+"""File extension -> format. `format_of` takes the first match, so longer extensions come first."""
 
 
 def format_of(path: Path) -> str:
-    """The ending of ``path`` in `FORMATS`, or of a format that another package brings. Raises InputError for
-    any other.
+    """Return the file extension of ``path`` in `FORMATS`, or that of a format from another package.
+
+    Raises:
+        InputError: The extension is unknown.
     """
     name = path.name.lower()
-    for endings in (FORMATS, brought := plugins("formats")):
-        for ending in endings:
-            if name.endswith(f".{ending}"):
-                return ending
+    for extensions in (FORMATS, external := plugins("formats")):
+        for extension in extensions:
+            if name.endswith(f".{extension}"):
+                return extension
     raise InputError(
-        f"{path} has no ending that says what to write",
-        hint=f"end it with one of .{', .'.join((*FORMATS, *brought))}",
+        f"the file extension of {path} is not a known scene format",
+        hint=f"use one of .{', .'.join((*FORMATS, *external))}",
     )
 
 
 def _format(kind: str) -> Format:
-    found: Format = FORMATS[kind] if kind in FORMATS else load_part("formats", kind)
+    found: Format = FORMATS[kind] if kind in FORMATS else load_plugin("formats", kind)
     return found
 
 
 def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None:
-    """Raise InputError for what files of ``kind`` do not have."""
+    """Raise InputError if the format ``kind`` does not support the up axis or the option."""
     if up not in (None, "y") and _format(kind).y_up:
-        raise InputError(f"in a .{kind} y is always up", hint="give --up y, or leave it out")
+        raise InputError(f"in .{kind} files y is always up", hint="give --up y, or omit --up")
     if spz_version is not None and kind != "spz":
-        raise InputError(f"a .{kind} has no SPZ version", hint="leave out --spz-version")
+        raise InputError(f"a .{kind} file has no SPZ version", hint="omit --spz-version")
 
 
 def write_scene(
     path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: int | None = None
 ) -> None:
-    """Write ``scene`` to ``path`` as `format_of` calls its kind, atomically.
+    """Write a scene atomically.
 
-    The scene has our axes, or with ``turned`` those that the file is to have.
+    Args:
+        path: File to write.
+        scene: Scene to write.
+        kind: Format, as `format_of` returns it.
+        turned: True: the scene already has the axes of the file. False: it is rotated to them.
+        spz_version: Version of an SPZ file (None: 3).
     """
     target = _format(kind)
     if target.axes != _AS_IS and not turned:
@@ -127,15 +136,16 @@ def write_scene(
 
 
 def padded(scene: Scene, sh_degree: int) -> Scene:
-    """``scene`` with zeros for spherical harmonics up to ``sh_degree``: the Inria code reads degree 3 only.
+    """Pad the spherical harmonics of a scene with zeros to a degree (the Inria code reads degree 3 only).
 
-    Raises InputError when the scene has a higher degree.
+    Raises:
+        InputError: The scene has a higher degree.
     """
     gaussians, coefficients = scene.gaussians, (sh_degree + 1) ** 2
     if sh_degree < gaussians.sh_degree:
         raise InputError(
             f"the scene has spherical harmonics of degree {gaussians.sh_degree}",
-            hint=f"give --sh-degree {gaussians.sh_degree} or more, or leave it out",
+            hint=f"give --sh-degree {gaussians.sh_degree} or more, or omit it",
         )
     sh = torch.zeros(gaussians.num, coefficients, 3)
     sh[:, : gaussians.sh.shape[1]] = gaussians.sh

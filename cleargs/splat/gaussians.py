@@ -1,4 +1,4 @@
-"""The scene: raw (pre-activation) parameters of N anisotropic Gaussians."""
+"""The parameters of N anisotropic Gaussians, before activation."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from cleargs.splat.constants import SH_DEGREES
 
 @dataclass
 class Gaussians:
-    """Parameters of N Gaussians as the optimiser sees them, in the layout of Inria's PLY.
+    """Parameters of N Gaussians as the optimiser changes them, with the conventions of the Inria PLY.
 
-    The covariance is R diag(exp(2 log_scales)) Rᵀ with R from the normalised quaternion, the opacity
-    is sigmoid(logit_opacities), the colour in sRGB is max(SH(direction) + 0.5, 0). K, the number of
-    stored SH coefficients, is 1, 4, 9 or 16 (degree 0 to 3).
+    The covariance is R diag(exp(2 log_scales)) Rᵀ with R from the normalised quaternion. The opacity is
+    sigmoid(logit_opacities). The colour is max(SH(direction) + 0.5, 0) in sRGB. K, the number of SH
+    coefficients per channel, is 1, 4, 9 or 16 (degree 0 to 3).
 
-    The same class holds the gradients of a loss with respect to these parameters.
+    The class also holds the gradients of a loss with respect to these parameters.
 
     Raises:
-        InputError: when the shapes do not belong together.
+        InputError: The tensors differ in N, precision or device, or have an unexpected shape.
     """
 
     means: Tensor  # [N, 3] world units
@@ -46,17 +46,17 @@ class Gaussians:
             if tuple(tensor.shape) != shape:
                 raise InputError(
                     f"{name} has the shape {tuple(tensor.shape)}, expected {shape} for {n} Gaussians",
-                    hint="all five parameters must describe the same Gaussians",
+                    hint="give all five parameters of the same Gaussians",
                 )
             if tensor.dtype != self.means.dtype or tensor.device != self.means.device:
                 raise InputError(
                     f"{name} is {tensor.dtype} on {tensor.device}, "
                     f"means are {self.means.dtype} on {self.means.device}",
-                    hint="keep all five parameters in one precision on one device",
+                    hint="use the same precision and device for all five parameters",
                 )
         if k not in SH_DEGREES:
             raise InputError(
-                f"sh holds {k} coefficients a channel", hint="store 1, 4, 9 or 16 of them (degree 0 to 3)"
+                f"sh has {k} coefficients per channel", hint="give 1, 4, 9 or 16 of them (degree 0 to 3)"
             )
 
     @property
@@ -66,30 +66,30 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree that the storage holds."""
+        """Degree of the stored spherical harmonics, 0 to 3."""
         return SH_DEGREES[int(self.sh.shape[1])]
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors lie."""
+        """Device of the tensors."""
         return self.means.device
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five parameter tensors by name, in the order of the fields."""
+        """Return the five parameter tensors by name, in the order of the fields."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def to(self, device: torch.device | str) -> Gaussians:
-        """The same Gaussians on another device."""
+        """Return the Gaussians on a device."""
         return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     def clone(self) -> Gaussians:
-        """A copy that shares no memory."""
+        """Return a copy that shares no memory."""
         return Gaussians(**{name: tensor.clone() for name, tensor in self.tensors().items()})
 
     def detach(self) -> Gaussians:
-        """The same memory outside any autograd graph."""
+        """Return the Gaussians detached from the autograd graph; they share memory."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
     def select(self, index: Tensor) -> Gaussians:
-        """The Gaussians that a bool mask or an index tensor names, as contiguous copies."""
+        """Return contiguous copies of the Gaussians at ``index``, a bool mask [N] or indices."""
         return Gaussians(**{name: tensor[index].contiguous() for name, tensor in self.tensors().items()})

@@ -1,8 +1,8 @@
 """``.glb`` with KHR_gaussian_splatting: points whose attributes are the parameters of Gaussians.
 
-Scales and opacities are stored after activation (standard deviations, and 0 to 1), rotations as x y z w,
-spherical harmonics as they are. COLOR_0 lets programs that know nothing of Gaussians show coloured points.
-Source: the Khronos extension's text.
+Scales and opacities are stored after activation (standard deviations, and 0 to 1), rotations as x y z w, and
+spherical harmonics unchanged. Programs without the extension show coloured points from COLOR_0. Source: the
+specification of the Khronos extension.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def glb(scene: Scene) -> bytes:
-    """The bytes of ``scene``, whose y is up as glTF wants it; equal scenes give equal bytes."""
+    """Encode a scene whose y axis is up, as in glTF; equal scenes give equal bytes."""
     columns = _columns(scene)
     data = b""
     views: list[dict[str, Any]] = []
@@ -76,7 +76,7 @@ def glb(scene: Scene) -> bytes:
 
 
 def _columns(scene: Scene) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]:
-    """Attribute -> values [N, 1, 3 or 4]."""
+    """Return the attributes of the points: name -> values [N, 1, 3 or 4]."""
     gaussians = scene.gaussians.to("cpu").detach()
     sh = gaussians.sh.numpy()
     alpha = torch.sigmoid(gaussians.logit_opacities).numpy()[:, None]

@@ -1,4 +1,4 @@
-"""The Gaussians that a training starts from: one a sparse point, more between them where points are few."""
+"""Initial Gaussians of a training: one per sparse point, and more in between if there are few points."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.views import TrainingView
 
 NEIGHBOURS = 3
-"""Neighbours whose mean distance is a starting scale (Inria), and whose depth an added point takes."""
+"""Number of neighbours that set the initial scale (mean distance, Inria) and the depth of added points."""
 
 DEPTH_JITTER = 0.05
-"""Standard deviation of the log depth of added points around their neighbours' depth."""
+"""Standard deviation of the noise on the log depth of added points."""
 
 BLIND_DEPTHS = (0.5, 5.0)
-"""Depths between which points are added where a view sees no sparse point; the cameras span a radius of 1."""
+"""Range of depths of added points if a view observes no sparse point (the cameras span a radius of 1)."""
 
 
 @dataclass(frozen=True, eq=False)
 class SparsePoints:
-    """The sparse reconstruction as the views of a training see it."""
+    """Sparse points, and the training views that observe them."""
 
     xyz: NDArray[np.float64]  # [P, 3] normalised world
     rgb: NDArray[np.uint8]  # [P, 3] sRGB
     observed: list[NDArray[np.int64]]
-    """For each view, the rows of ``xyz`` that it observes."""
+    """Rows of ``xyz`` that each view observes."""
 
     @classmethod
     def seen_by(
@@ -44,7 +44,7 @@ class SparsePoints:
         rgb: NDArray[np.uint8],  # [P, 3]
         observations: tuple[NDArray[np.int32], NDArray[np.int64]],  # frame_id [M], point_id [M]
     ) -> SparsePoints:
-        """All points, and which of them each of these frames observes."""
+        """Return all points, and the rows of ``xyz`` that each frame of ``frame_ids`` observes."""
         order = np.argsort(point_id)
         frame, point = observations
         index = order[np.searchsorted(point_id, point, sorter=order)]
@@ -61,18 +61,24 @@ def starting_gaussians(
     seed: int,
     say: Callable[[str], None] = lambda remark: None,
 ) -> Gaussians:
-    """Return one Gaussian per sparse point, and more behind random pixels of the views until there are
-    ``at_least``; never more than ``at_most``. ``say`` receives a line on points added or left out.
+    """Return the Gaussians that a training starts from.
 
-    Where ``sh_degree`` is None it follows the number of views.
+    Args:
+        sparse: Sparse points: one Gaussian each.
+        views: Training views, in the order of ``sparse.observed``.
+        at_least: Minimum number of Gaussians; the missing ones are added behind random pixels of the views.
+        at_most: Maximum number of Gaussians (None: no limit); a random subset of the points is used.
+        sh_degree: Degree of the spherical harmonics (None: `sh_degree_from_views`).
+        seed: Seed of the random choices.
+        say: Function that receives a message if points are added or left out.
     """
     most = at_most or max(at_least, len(sparse.xyz))
     if len(sparse.xyz) > most:
-        say(f"{most} of {len(sparse.xyz)} sparse points, which g0.budget allows")
-        sparse = fewer_points(sparse, most, seed=seed)
+        say(f"using {most} of {len(sparse.xyz)} sparse points (limit: g0.budget)")
+        sparse = subsample_points(sparse, most, seed=seed)
     missing = min(at_least, most) - len(sparse.xyz)
     if missing > 0:
-        say(f"{len(sparse.xyz)} sparse points, {missing} are added between them")
+        say(f"starting from {len(sparse.xyz)} sparse points and {missing} added points")
         sparse = add_points(sparse, views, missing, seed=seed)
     if sh_degree is None:
         sh_degree = sh_degree_from_views(len(views))
@@ -80,18 +86,18 @@ def starting_gaussians(
 
 
 def sh_degree_from_views(count: int) -> int:
-    """Largest SH degree that pays with ``count`` active frames: 0 below 12, 1 below 40, 2 below 100, then 3.
+    """Return the SH degree for ``count`` active frames: 0 below 12, 1 below 40, 2 below 100, then 3.
 
-    Few directions fix few terms: the others learn to explain the frames one by one, and cost time.
+    Few directions of view determine few terms. Further terms would overfit single frames, and cost time.
     """
     return 0 if count < 12 else 1 if count < 40 else 2 if count < 100 else 3
 
 
 def from_points(sparse: SparsePoints, sh_degree: int) -> Gaussians:
-    """One isotropic Gaussian a point.
+    """Return one isotropic Gaussian per point.
 
-    Its scale is `INIT_SCALE` times the mean distance to the three nearest points; its colour fills the SH
-    constant.
+    The scale is `INIT_SCALE` times the mean distance to the three nearest points. The colour sets the
+    constant term of the SH.
     """
     xyz, rgb = sparse.xyz, sparse.rgb
     count = len(xyz)
@@ -114,22 +120,22 @@ def from_points(sparse: SparsePoints, sh_degree: int) -> Gaussians:
     )
 
 
-def fewer_points(sparse: SparsePoints, count: int, *, seed: int) -> SparsePoints:
-    """``count`` of the points, drawn at random, in their order."""
+def subsample_points(sparse: SparsePoints, count: int, *, seed: int) -> SparsePoints:
+    """Return a random subset of ``count`` points, in their order."""
     rng = np.random.default_rng([seed, Stream.LEFT_OUT_POINTS])
     kept = np.sort(rng.permutation(len(sparse.xyz))[:count])
-    place = np.full(len(sparse.xyz), -1)
-    place[kept] = np.arange(count)
-    observed = [place[seen][place[seen] >= 0] for seen in sparse.observed]
+    new_row = np.full(len(sparse.xyz), -1)
+    new_row[kept] = np.arange(count)
+    observed = [new_row[seen][new_row[seen] >= 0] for seen in sparse.observed]
     return SparsePoints(sparse.xyz[kept], sparse.rgb[kept], observed)
 
 
 def add_points(sparse: SparsePoints, views: Sequence[TrainingView], count: int, *, seed: int) -> SparsePoints:
-    """``sparse`` with ``count`` more points (none observed), spread evenly over the views and their pixels.
+    """Add ``count`` points, the same number behind random pixels of each view.
 
-    A point lies behind a random unmasked pixel, at the depth of the sparse points that the view observes
-    nearest to that pixel (mean log depth of three, with a little noise), and takes the pixel's colour. Where
-    a view observes no sparse point its depths are spread evenly in log between BLIND_DEPTHS.
+    Each point has the colour of an unmasked pixel. Its depth is the mean log depth of the three observed
+    sparse points that project nearest to the pixel, plus noise (`DEPTH_JITTER`). If a view observes no sparse
+    point, log depths are uniform between `BLIND_DEPTHS`. Added points are not observed.
     """
     shares = np.full(len(views), count // len(views))
     shares[: count % len(views)] += 1
@@ -146,7 +152,7 @@ def add_points(sparse: SparsePoints, views: Sequence[TrainingView], count: int, 
 def _points_of_view(
     view: TrainingView, seen: NDArray[np.float64], count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """``count`` points behind random pixels of one view, given the sparse points [S, 3] it sees."""
+    """Return positions and colours of points behind random pixels of a view that sees ``seen`` [S, 3]."""
     camera = view.camera
     image, mask = view.load()
     rows, columns = np.nonzero(mask) if mask is not None else np.indices(image.shape[:2]).reshape(2, -1)

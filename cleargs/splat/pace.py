@@ -1,8 +1,8 @@
-"""How fast this machine is beside the one on which the costs of the stages were measured.
+"""Pace of this machine: its time for a training iteration, relative to the reference machine.
 
-``python -m cleargs.splat.pace`` prints the milliseconds that a training iteration takes here, on one thread.
-On the reference machine, quiet or not, that gives `REFERENCE_MS`; it and the constants of the stages'
-``estimate`` belong together and are made again together (docs/experiments/speed.md).
+``python -m cleargs.splat.pace`` prints the milliseconds of processor time that a training iteration takes on
+one thread. `REFERENCE_MS` is the output on the reference machine. The constants of the stages' ``estimate``
+were measured there, too. Measure them together (docs/experiments/speed.md).
 """
 
 from __future__ import annotations
@@ -29,44 +29,48 @@ if TYPE_CHECKING:
     from cleargs.splat.gaussians import Gaussians
 
 PROBE = 1
-"""Raised with whatever changes the milliseconds on one and the same machine: others are not read then."""
+"""Version of the measurement. Increment it with each change that affects the time on the same machine."""
 
 SPLATS, WIDTH, HEIGHT = 50_000, 640, 360
 REPEATS = 12
 
 REFERENCE_MS = 80.0
-"""Of an iteration on the reference machine: a core of an Intel Xeon (Emerald Rapids, AVX-512)."""
+"""Time of an iteration on the reference machine: one core of an Intel Xeon (Emerald Rapids, AVX-512)."""
 
 TIMEOUT_S = 300
-"""Two seconds of work; where no kernel is compiled yet, half a minute and more."""
+"""Time limit of a measurement. It takes 2 s, or over 30 s if kernels must be compiled."""
 
 
 def machine_pace(say: Callable[[str], None] | None = None) -> float:
-    """This machine's time over that of the reference machine; 1 where nothing is known of it.
+    """Return the time of an iteration on this machine, relative to the reference machine.
 
-    Remembered from an earlier measurement. Without one it is measured where somebody is told so (``say``).
+    Args:
+        say: Function that receives a message before a measurement. None: do not measure, only read the cache.
+
+    Returns:
+        The cached or measured pace, greater than 1 for slower machines; 1 if it is unknown.
     """
     pace = cached_pace()
     if pace is not None or say is None:
         return 1.0 if pace is None else pace
-    say("measuring the pace of this machine (once; kernels may have to be compiled for it)")
-    milliseconds = _measured()
+    say("measuring the speed of this machine (once; longer if kernels must be compiled)")
+    milliseconds = _measure_in_subprocess()
     if milliseconds is None:
         return 1.0
     with suppress(StoreError):
-        write_json(_note(), {"milliseconds": milliseconds})
+        write_json(_cache_file(), {"milliseconds": milliseconds})
     return milliseconds / REFERENCE_MS
 
 
 def cached_pace() -> float | None:
-    """What was measured on this machine before; None where nothing was, or the note of it is damaged."""
+    """Return the pace that was measured earlier on this machine, or None."""
     with suppress(*FAULTS):
-        return _sound(read_json(_note())["milliseconds"]) / REFERENCE_MS
+        return _checked(read_json(_cache_file())["milliseconds"]) / REFERENCE_MS
     return None
 
 
 def processor_name() -> str:
-    """Return the model of the first core as Linux names it, elsewhere the architecture."""
+    """Return the model name of the processor on Linux, or the architecture on other systems."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -78,10 +82,17 @@ def processor_name() -> str:
 def random_scene(
     count: int, width: int, height: int, *, sigma: float = 1.8, seed: int = 0
 ) -> tuple[Gaussians, Camera]:
-    """Return ``count`` random splats of SH degree 3, evenly over the view of a camera at the origin.
+    """Return random Gaussians of SH degree 3 in the view of a camera at the origin, and the camera.
 
-    ``sigma`` is the median standard deviation of a projected splat in px. Opacities are in [0.05, 0.95],
-    depths in [2, 10]. Equal arguments give equal splats.
+    The density in the image is uniform. Opacities are in [0.05, 0.95], depths in [2, 10]. Equal arguments
+    give equal Gaussians.
+
+    Args:
+        count: Number of Gaussians.
+        width: Width of the image, px.
+        height: Height of the image, px.
+        sigma: Median standard deviation of a projected splat, px.
+        seed: Seed of the random numbers.
     """
     import numpy as np
     import torch
@@ -105,34 +116,34 @@ def random_scene(
     return Gaussians(*tensors), Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
 
-def _note() -> Path:
-    """A file for each machine (a cluster's machines share their home), and for each version of the probe."""
+def _cache_file() -> Path:
+    """Return the file of this machine and this `PROBE`; machines of a cluster share their home folder."""
     machine = {"host": platform.node(), "processor": processor_name(), "probe": PROBE}
     name = hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:16]
     return cache_folder("pace") / f"{name}.json"
 
 
-def _measured() -> float | None:
-    """In a process of its own: neither its memory nor its one thread are to stay with a run."""
+def _measure_in_subprocess() -> float | None:
+    """Measure in a subprocess, so that its memory and its thread settings do not affect a run."""
     try:
         command = module_command("cleargs.splat.pace")
         done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=TIMEOUT_S)
-        return _sound(json.loads(done.stdout))
+        return _checked(json.loads(done.stdout))
     except (OSError, ValueError, TypeError, subprocess.SubprocessError):
         return None
 
 
-def _sound(milliseconds: float) -> float:
+def _checked(milliseconds: float) -> float:
     if not 0.0 < milliseconds < math.inf:
-        raise ValueError("no time takes so long")
+        raise ValueError(f"{milliseconds} is not a valid time")
     return milliseconds
 
 
 def _measure() -> float:
-    """Milliseconds of processor time of the fastest iteration.
+    """Return the processor time of the fastest iteration in milliseconds.
 
-    Of the processor, and the fastest, since other work on the machine only ever adds to it. The first
-    compiles the kernels, and is never the fastest.
+    Other work on the machine can only increase a time, so the fastest iteration is the best estimate. The
+    first iteration compiles the kernels, and is never the fastest.
     """
     import torch
 

@@ -1,7 +1,8 @@
-"""``scene.ply`` in the layout of the Inria code, which viewers read: binary little endian, float32.
+"""``scene.ply`` in the layout of the Inria code, which most viewers read: binary little endian, float32.
 
-Values are stored before activation: log scales, opacity logits, unnormalised quaternions (w x y z). Comments
-hold what the layout has no place for: the anti-aliasing mode and the background.
+Values are stored before activation: log scales, opacity logits and unnormalised quaternions (w x y z).
+Comments in the header store the anti-aliasing mode and the background, for which the layout has no
+properties.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from cleargs.splat.scene import Scene
 _ANTIALIAS = "cleargs antialias"
 _BACKGROUND = "cleargs background"
 _MAX_LINE_BYTES = 4096
-"""Most bytes of a line of the header."""
+"""Maximum length of a line in the header."""
 
 
 def write_ply(path: Path, scene: Scene) -> None:
-    """Write ``scene`` atomically; equal scenes give equal bytes."""
+    """Write a scene atomically; equal scenes give equal bytes."""
     gaussians = scene.gaussians.to("cpu")
     count, coefficients = gaussians.num, gaussians.sh.shape[1]
     names = _properties(coefficients)
@@ -54,8 +55,8 @@ def write_ply(path: Path, scene: Scene) -> None:
 def read_ply(path: Path) -> Scene:
     """Read a scene in the Inria layout, with float32 properties in any order.
 
-    Raises StoreError when the file is missing, cut short, lacks a property, or holds a value that is not
-    finite.
+    Raises:
+        StoreError: The file is missing or truncated, lacks a property, or has a value that is not finite.
     """
     try:
         with open_regular(path) as file:
@@ -65,7 +66,7 @@ def read_ply(path: Path) -> Scene:
         rest = sum(name.startswith("f_rest_") for name in names)
         coefficients = rest // 3 + 1
         if coefficients not in (1, 4, 9, 16) or rest % 3:
-            raise ValueError(f"{rest} f_rest_ properties fit no SH degree")
+            raise ValueError(f"{rest} f_rest_ properties do not match an SH degree from 0 to 3")
 
         def get(*wanted: str) -> torch.Tensor:
             return torch.from_numpy(np.stack([columns[name] for name in wanted], axis=1).astype(np.float32))
@@ -77,7 +78,7 @@ def read_ply(path: Path) -> Scene:
             sh[:, 1:] = by_colour.transpose(1, 2)
         background = tuple(float(c) for c in comments.get(_BACKGROUND, "0 0 0").split())
         if len(background) != 3:
-            raise ValueError("the background needs three values")
+            raise ValueError("the background does not have three values")
         gaussians = Gaussians(
             means=get("x", "y", "z"),
             log_scales=get("scale_0", "scale_1", "scale_2"),
@@ -96,12 +97,12 @@ def read_ply(path: Path) -> Scene:
     except FAULTS as error:
         raise StoreError(
             f"cannot read the scene {path}: {cause(error)}",
-            hint="run the stage that wrote it again with --force",
+            hint="repeat the stage that wrote it with --force",
         ) from error
 
 
 def _properties(coefficients: int) -> list[str]:
-    """Names in the order of the Inria code, for ``coefficients`` SH terms a colour."""
+    """Return the property names in the order of the Inria code, for this number of SH terms per channel."""
     return [
         *("x", "y", "z", "nx", "ny", "nz"),
         *(f"f_dc_{i}" for i in range(3)),
@@ -113,22 +114,22 @@ def _properties(coefficients: int) -> list[str]:
 
 
 def _read_header(file: BinaryIO) -> tuple[int, list[str], dict[str, str]]:
-    """Number of vertices, property names, and ClearGS's comments; leaves ``file`` at the first vertex."""
+    """Read the number of vertices, the property names and the comments of ClearGS (name -> value)."""
     lines: list[list[str]] = []
     while (line := file.readline(_MAX_LINE_BYTES)) not in (b"end_header\n", b"end_header\r\n"):
         if not line.endswith(b"\n") or len(lines) > 1000:
-            raise ValueError("the header does not end")
+            raise ValueError("the header has no end")
         if words := line.decode("ascii").split():
             lines.append(words)
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise ValueError("not a binary little endian PLY")
     elements = [line for line in lines if line[0] == "element"]
     if [line[:2] for line in elements] != [["element", "vertex"]] or len(elements[0]) != 3:
-        raise ValueError("expected vertices and nothing else")
+        raise ValueError("it has elements other than vertices")
     if not elements[0][2].isdecimal():
-        raise ValueError(f"{elements[0][2]} is no number of vertices")
+        raise ValueError(f"{elements[0][2]} is not a number of vertices")
     properties = [line for line in lines if line[0] == "property"]
     if any(len(line) != 3 or line[1] not in ("float", "float32") for line in properties):
-        raise ValueError("expected float properties only")
+        raise ValueError("it has properties that are not float")
     comments = {" ".join(line[1:3]): " ".join(line[3:]) for line in lines if line[0] == "comment"}
     return int(elements[0][2]), [line[2] for line in properties], comments

@@ -1,4 +1,4 @@
-"""A scene: Gaussians and how they are meant to be rendered, exactly what a ``scene.ply`` says."""
+"""A scene: Gaussians and their rendering options, as ``scene.ply`` stores them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Scene:
 
     gaussians: Gaussians
     antialias: bool = False
-    """Whether opacities of sub-pixel splats are compensated (Mip-Splatting)."""
+    """True: the opacities of splats smaller than a pixel are compensated (Mip-Splatting)."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """sRGB behind everything, in [0, 1]."""
+    """Colour of the background, sRGB in [0, 1]."""
 
     def to(self, device: torch.device | str) -> Scene:
-        """The same scene with its Gaussians on another device."""
+        """Return the scene with its Gaussians on a device."""
         return replace(self, gaussians=self.gaussians.to(device))

@@ -1,4 +1,4 @@
-"""What a training does at each step of its schedule: rates, size of images, SH degree, refinements."""
+"""The schedule of a training: rates, image size, SH degree and refinements at each step."""
 
 from __future__ import annotations
 
@@ -10,29 +10,37 @@ from cleargs.splat.config import TrainConfig
 from cleargs.splat.types import Rate
 
 SH_REST_DIVISOR = 5.0
-"""The SH terms above the constant learn this much slower. (Inria: 20, at which highlights take more steps
-than a CPU has.)"""
+"""Divisor of the rate of the SH terms above the constant (Inria: 20, with which highlights need more steps
+than a training on a CPU has)."""
 INRIA_STEPS = 30_000
-"""Steps of the training that the rates of 3DGS are made for."""
+"""Number of steps for which the rates of 3DGS were chosen."""
 MAX_RATE_FACTOR = 6.0
+"""Upper limit of `rate_factor` (docs/training.md)."""
 
 ERROR_STEPS = 5
-"""Steps before a refinement whose errors say what is to grow, one frame each. Where refinements follow each
-other within eight times as many steps there are fewer, since each costs a backward pass."""
+"""Number of steps before a refinement that measure its errors, one frame each. Each costs a backward pass, so
+at most an eighth of the steps between refinements measure errors."""
 
 
 def rate_factor(steps: int) -> float:
-    """How much faster means, scales, rotations and SH learn in a training of so many steps than in one of
-    `INRIA_STEPS`: a step of Adam is as long as its rate, so a short training with the rates of a long one
-    ends before they have got where they go (docs/training.md).
+    """Return the factor on the rates of means, scales, rotations and SH for a schedule of ``steps`` steps.
+
+    The rates of 3DGS are for `INRIA_STEPS`. The length of a step of Adam is about its rate, so a shorter
+    training needs larger rates to cover the same distance (docs/training.md).
     """
     return min(MAX_RATE_FACTOR, max(1.0, math.sqrt(INRIA_STEPS / steps)))
 
 
 class Schedule:
-    """What ``config`` says of each step. ``step`` is how many steps of the whole schedule lie behind.
+    """Values of the schedule at each step.
 
-    The world is normalised, so the scene's extent is 1.
+    In all methods ``step`` is the number of finished steps of the whole schedule. Rates of means are in units
+    of the normalised world, so they need no factor for the extent of the scene (Inria: ``spatial_lr_scale``).
+
+    Args:
+        config: Settings with a number of steps (`cleargs.splat.budget.resolve_config`).
+        coefficients: Number of stored SH coefficients K.
+        device: Device of the Gaussians.
     """
 
     def __init__(self, config: TrainConfig, coefficients: int, device: torch.device | str = "cpu") -> None:
@@ -65,21 +73,21 @@ class Schedule:
         }
 
     def image_factor(self, step: int) -> float:
-        """Return the factor on width and height of the images."""
+        """Return the factor on width and height of the training images."""
         config = self._config
         return config.coarse_factor if step < config.coarse_share * config.planned else 1.0
 
     def sh_degree(self, step: int, largest: int) -> int:
-        """Return the SH degree in use, of Gaussians that store ``largest``."""
+        """Return the SH degree to render, at most the stored degree ``largest``."""
         every = self._config.sh_every * self._config.planned
         return largest if every == 0 else min(largest, int(step / every))
 
     def refines(self, step: int) -> bool:
-        """Return whether a refinement is due after that many steps."""
+        """Return True if a refinement is due after ``step`` steps."""
         return step % self._config.refine_interval == 0 and self._refined(step)
 
     def wants_errors(self, step: int) -> bool:
-        """Return whether the step after these adds to the errors by which the next refinement goes."""
+        """Return True if the next step measures errors for the next refinement."""
         interval = self._config.refine_interval
         refined = -(-(step + 1) // interval) * interval
         return refined - (step + 1) < min(ERROR_STEPS, max(1, interval // 8)) and self._refined(refined)

@@ -1,9 +1,9 @@
-"""``.spz``, Niantic's compressed splats: columns of fixed-point numbers.
+"""``.spz``, the compressed splats of Niantic: columns of fixed-point numbers.
 
-Version 3 is one gzip stream; version 4 compresses every column by itself (zstd), behind a plain header and a
-table of their sizes. The columns are the same: 24-bit positions, 8-bit opacities,
-colours and log scales, quaternions of their three smaller parts (10 bits each, sign and 9 bits), spherical
-harmonics of 8 bits from -1 to 1. Source: nianticlabs/spz, ``load-spz.cc`` and the README's "File Format".
+Version 3 is one gzip stream. Version 4 has an uncompressed header, a table of sizes, and one zstd stream per
+column. The columns are the same: positions of 24 bits; opacities, colours and log scales of 8 bits; the three
+smaller components of the quaternions, of 10 bits (sign and 9 bits); and spherical harmonics of 8 bits for -1
+to 1. Source: nianticlabs/spz, ``load-spz.cc`` and "File Format" in the README.
 """
 
 from __future__ import annotations
@@ -18,22 +18,27 @@ import torch
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.splat.compressed_ply import smaller_parts
+from cleargs.splat.compressed_ply import smallest_three
 from cleargs.splat.scene import Scene
 
 _MAGIC = 0x5053474E
-_HEADER_BYTES = 32  # of version 4; the table of sizes follows
+_HEADER_BYTES = 32  # header of version 4, before the table of sizes
 _ANTIALIASED = 1
-_COLOUR_SCALE = 0.15  # SH of degree 0 from -1/0.3 to 1/0.3 over the 8 bits
-_SH_STEPS = (8, 16)  # coefficients of degree 1 are rounded to 5 bits, higher ones to 4, as the original does
-_POSITION_BITS_MAX = 12
-_ZSTD_LEVEL = 12  # the original's
+_COLOUR_SCALE = 0.15  # the 8 bits cover SH of degree 0 from -1/0.3 to 1/0.3
+_SH_STEPS = (8, 16)  # coefficients of degree 1 are rounded to 5 bits, higher ones to 4 (load-spz.cc)
+_FRACTION_BITS_MAX = 12  # for positions (load-spz.cc)
+_ZSTD_LEVEL = 12  # as in load-spz.cc
 
 
 def spz(scene: Scene, version: int = 3) -> bytes:
-    """The bytes of ``scene``; equal scenes give equal bytes. The viewers of the format know no background.
+    """Encode a scene; equal scenes give equal bytes. The format has no background.
 
-    ``version`` is 3, which most programs read, or 4.
+    Args:
+        scene: Scene with the axes of the format: x right, y up, z back.
+        version: Version of the format: 3, which most programs read, or 4.
+
+    Raises:
+        InputError: The scene is too large for fixed-point positions.
     """
     gaussians = scene.gaussians.to("cpu").detach()
     count, coefficients = gaussians.num, gaussians.sh.shape[1]
@@ -41,11 +46,11 @@ def spz(scene: Scene, version: int = 3) -> bytes:
     reach = float(np.abs(means).max(initial=1e-9))
     if reach >= 2.0**23:
         raise InputError(
-            f"a scene that reaches {reach:.1e} units is too large for .spz, which counts to 8 million",
+            f"the scene has coordinates up to {reach:.1e}, but .spz stores at most 8 million",
             hint="export it in the normalised world (without --world input), or in another format",
         )
-    # As fine as 24 bits with a sign reach, and at most what the original takes by default.
-    fraction = int(np.clip(np.floor(23 - np.log2(max(reach, 1e-9)) - 1e-9), 0, _POSITION_BITS_MAX))
+    # As many bits as the largest coordinate leaves of 24 bits with sign.
+    fraction = int(np.clip(np.floor(23 - np.log2(max(reach, 1e-9)) - 1e-9), 0, _FRACTION_BITS_MAX))
     flags = _ANTIALIASED if scene.antialias else 0
     header = struct.pack("<IIIBBB", _MAGIC, version, count, gaussians.sh_degree, fraction, flags)
     steps = np.clip(np.rint(means * 2.0**fraction), -(2**23), 2**23 - 1).astype("<i4")
@@ -74,9 +79,9 @@ def _byte(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
 
 
 def _rotations(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4] w x y z -> [N]
-    """Of x, y, z, w: which is largest (2 bits), then of the others sign and magnitude, times sqrt(2)."""
-    # + 0.0, so that no zero has a sign of its own.
-    largest, smaller = smaller_parts(quaternions[:, [1, 2, 3, 0]].astype(np.float64) + 0.0)
+    """Pack the index of the largest of x, y, z, w, then sign and magnitude * sqrt(2) of the others."""
+    # + 0.0 turns -0.0 into 0.0.
+    largest, smaller = smallest_three(quaternions[:, [1, 2, 3, 0]].astype(np.float64) + 0.0)
     packed: NDArray[np.uint32] = largest.astype(np.uint32)
     for part in smaller.T:
         magnitude = np.clip(np.floor(511.0 * np.sqrt(2.0) * np.abs(part) + 0.5), 0, 511).astype(np.uint32)
@@ -85,7 +90,7 @@ def _rotations(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4
 
 
 def _harmonics(sh: NDArray[np.float32]) -> NDArray[np.uint8]:  # [N, K - 1, 3]
-    """128 + 128 times the coefficient, rounded to the middle of a step."""
+    """Encode coefficients as 128 + 128 * value, rounded to multiples of a step."""
     steps = np.where(np.arange(sh.shape[1]) < 3, *_SH_STEPS)[:, None]
     raw = np.rint(sh * 128.0) + 128.0
     return _byte(np.floor((raw + steps / 2) / steps) * steps)

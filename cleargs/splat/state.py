@@ -1,6 +1,6 @@
-"""Training state on disk: ``state.safetensors`` beside a finished scene, and checkpoints inside a stage.
+"""Training state on disk: ``state.safetensors`` next to a finished scene, and checkpoints within a stage.
 
-Everything is a tensor, the step included: metadata of several keys would be written in no fixed order.
+Everything is stored as a tensor, even the step: safetensors writes several metadata keys in no fixed order.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def save_state(path: Path, tensors: dict[str, Tensor]) -> None:
 
 
 def load_state(path: Path, reporter: Reporter) -> dict[str, Tensor] | None:
-    """The tensors at ``path``; None where there is no file, and (with a warning) where it is damaged."""
+    """Return the tensors in a file, or None if the file is missing or (with a warning) damaged."""
     if not path.exists():
         return None
     try:
@@ -36,11 +36,16 @@ def load_state(path: Path, reporter: Reporter) -> dict[str, Tensor] | None:
 
 
 def read_moments(path: Path, gaussians: Gaussians) -> Moments:
-    """Adam's moments of a finished training, from its state; they belong to ``gaussians``, its scene.
+    """Read the moments of Adam from the state of a finished training.
 
-    Raises StoreError when the file is missing or damaged, or is of other Gaussians.
+    Args:
+        path: The ``state.safetensors`` of the training.
+        gaussians: Scene of the same training, whose shapes the moments must have.
+
+    Raises:
+        StoreError: The file is missing or damaged, or belongs to a different scene.
     """
-    hint = "run the stage that made it again with --force"
+    hint = "repeat the stage that wrote it with --force"
     try:
         moments = Moments.of_state(load_file(path))
     except (OSError, SafetensorError, ValueError) as error:
@@ -48,5 +53,5 @@ def read_moments(path: Path, gaussians: Gaussians) -> Moments:
     expected = {name: tensor.shape for name, tensor in gaussians.tensors().items()}
     for group in (moments.first, moments.second):
         if {name: tensor.shape for name, tensor in group.items()} != expected:
-            raise StoreError(f"the moments in {path} are not of the scene beside it", hint=hint)
+            raise StoreError(f"the moments in {path} do not fit the scene next to it", hint=hint)
     return moments

@@ -1,4 +1,4 @@
-"""The tables that a training leaves: one row a step, one row a frame's exposure."""
+"""Schemas of the tables of a training: one row per step, and one row per frame with its exposure."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from cleargs.parquet import column
 
 TRAIN = pa.schema(
     [
-        column("round", pa.int32(), "round of the stage that trained, 0 where it has none"),
+        column("round", pa.int32(), "round of the stage, 0 if it has none"),
         column("step", pa.int32(), "step within the round, from 1"),
         column("frame_id", pa.int32(), "frame of the view"),
         column("kind", pa.string(), "real (the frame itself) or pseudo (its repair)"),
         column("weight", pa.float32(), "factor on this step's loss"),
-        column("width", pa.int32(), "of the image trained on, px"),
-        column("height", pa.int32(), "of the image trained on, px"),
+        column("width", pa.int32(), "width of the training image, px"),
+        column("height", pa.int32(), "height of the training image, px"),
         column("loss", pa.float64(), "weighted L1 + D-SSIM, without regularisation"),
         column("l1", pa.float64(), "mean absolute error over unmasked pixels, sRGB in [0, 1]"),
         column("ssim", pa.float64(), "mean SSIM over unmasked pixels"),
-        column("psnr", pa.float64(), "over unmasked pixels, dB, before the step"),
-        column("n_gaussians", pa.int32(), "Gaussians rendered"),
-        column("sh_degree", pa.int32(), "SH degree rendered"),
+        column("psnr", pa.float64(), "PSNR over unmasked pixels before the step, dB"),
+        column("n_gaussians", pa.int32(), "number of rendered Gaussians"),
+        column("sh_degree", pa.int32(), "rendered SH degree"),
     ]
 )
 

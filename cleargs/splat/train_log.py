@@ -1,4 +1,4 @@
-"""What shows how a training goes: its log, one row per step, and ``preview.png`` next to a checkpoint."""
+"""Log of a training, one row per step, and the ``preview.png`` next to a checkpoint."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ _ROW = np.dtype(
         if field.name not in ("round", "step")
     ]
 )
-"""A step; ``kind`` is true for a pseudo view."""
+"""Type of a row in memory; ``kind`` is True for a pseudo view."""
 
 _RECENT = 50
-"""Steps that a running mean looks back."""
+"""Number of steps in the running mean of the PSNR."""
 
 PREVIEW_SIDE = 640
-"""Longer side of a preview in px, at most."""
+"""Maximum of the longer side of a preview, px."""
 
 
 class TrainLog:
-    """What each of ``steps`` steps saw and what came of it. Steps count from 0 here, from 1 in the table."""
+    """Views and losses of ``steps`` steps. Steps count from 0 in the methods, and from 1 in the table."""
 
     def __init__(self, steps: int) -> None:
         self._rows = np.zeros(steps, _ROW)
 
-    def seen(
+    def add_view(
         self, step: int, view: TrainingView, weight: float, target: Tensor, n_gaussians: int, sh_degree: int
     ) -> None:
-        """Write what a step trains on; `measured` fills in the rest."""
+        """Write the view of a step. `add_losses` adds the other columns."""
         self._rows[step] = (
             view.frame_id,
             view.kind == "pseudo",
@@ -53,30 +53,30 @@ class TrainLog:
             sh_degree,
         )
 
-    def measured(self, step: int, reading: Reading) -> None:
-        """Write what a step measured, which from a GPU is known some steps later."""
+    def add_losses(self, step: int, reading: Reading) -> None:
+        """Write the losses of a step. A GPU reports them some steps later."""
         self._rows[["loss", "l1", "ssim", "psnr"]][step] = reading
 
     def recent_psnr(self, done: int) -> float:
-        """Mean PSNR in dB of the last steps before ``done``; NaN before the first.
+        """Return the mean PSNR in dB of the last 50 steps before step ``done`` (NaN if there are none).
 
-        That of a frame of which no pixel counts is infinite, and left out.
+        Steps on fully masked frames have an infinite PSNR, and are left out.
         """
         recent = self._rows["psnr"][max(0, done - _RECENT) : done]
         recent = recent[np.isfinite(recent)]
         return float(recent.mean()) if len(recent) else math.nan
 
     def packed(self, done: int) -> Tensor:
-        """The first ``done`` rows as bytes, for a checkpoint."""
+        """Return the first ``done`` rows as bytes, for a checkpoint."""
         return torch.from_numpy(self._rows[:done].view(np.uint8).copy())
 
     def restore(self, packed: Tensor) -> None:
-        """Resume from what `packed` gave."""
+        """Continue from the result of `packed`."""
         rows = packed.numpy().view(_ROW)
         self._rows[: len(rows)] = rows
 
     def table(self, done: int, round: int) -> pa.Table:
-        """The first ``done`` rows, schema `cleargs.splat.tables.TRAIN`."""
+        """Return the first ``done`` rows with the schema `cleargs.splat.tables.TRAIN`."""
         rows = self._rows[:done]
         columns = {name: rows[name] for name in _ROW.names or ()}
         columns |= {

@@ -1,4 +1,4 @@
-"""A scene in another world: similarity transforms of Gaussians, and worlds with an up axis of their own."""
+"""Similarity transforms of scenes, and rotations to worlds with a given up axis."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
 MAX_REACH = 1e18
-"""Farthest that a scene may reach, and the inverse of the least: their squares are single precision's."""
+"""Limit of the size of a scene, whose inverse is the lower limit: the squares of both fit in float32."""
 
 UP: Mapping[str, tuple[tuple[float, ...], ...]] = {
     "-y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
 }
-"""Up axis -> the matrix from x right, y down, z forward. Programs with y up look along -z, and with z up
-along y, before anyone moves their camera."""
+"""Up axis -> rotation matrix from a world with x right, y down, z forward. Cameras of programs with y up look
+along -z at first, those with z up along y."""
 
 _DIRECTIONS = 64
-"""Directions in which two SH functions are compared; 16 coefficients need at least 16."""
+"""Number of directions in which two SH functions are compared; 16 coefficients need at least 16."""
 
 
 ROUNDED = 0.1
@@ -56,11 +56,21 @@ def transform_scene(
     rotation: NDArray[np.float64],  # [3, 3]
     translation: NDArray[np.float64],  # [3]
 ) -> Scene:
-    """The scene under x -> scale rotation x + translation; renders of moved cameras stay the same.
+    """Apply the similarity x -> scale rotation x + translation to a scene.
 
-    ``rotation`` must be proper (determinant 1) and ``scale`` positive, else ValueError is raised. Computed
-    in float64; the result is float32 as the files are, so an offset that is large beside the scene costs
-    digits of the means. Raises InputError where it would not be finite.
+    Cameras that are transformed in the same way see the same images. The computation is in float64 and the
+    result in float32, like the files. A translation much larger than the scene therefore reduces the
+    precision of the means.
+
+    Args:
+        scene: Scene to transform; it is not changed.
+        scale: Positive factor.
+        rotation: Proper rotation (determinant 1).
+        translation: Translation in units of the new world.
+
+    Raises:
+        ValueError: The transform is not a similarity.
+        InputError: The result exceeds the range of float32.
     """
     if (
         scale <= 0
@@ -75,25 +85,25 @@ def transform_scene(
     )
     quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)  # x y z w -> w x y z
     mixing = sh_rotation(turn, gaussians.sh.shape[1])
-    moved = Gaussians(
+    transformed = Gaussians(
         means=means.float(),
         log_scales=(gaussians.log_scales.double() + math.log(scale)).float(),
         rotations=_multiply(torch.from_numpy(quaternion), gaussians.rotations.double()).float(),
         logit_opacities=gaussians.logit_opacities.clone(),
         sh=torch.einsum("jk,nkc->njc", mixing, gaussians.sh.double()).float().contiguous(),
     )
-    reach, before = (float(which.means.abs().max()) if which.num else 1.0 for which in (moved, gaussians))
-    finite = all(bool(torch.isfinite(tensor).all()) for tensor in moved.tensors().values())
+    reach, before = (float(g.means.abs().max()) if g.num else 1.0 for g in (transformed, gaussians))
+    finite = all(bool(torch.isfinite(tensor).all()) for tensor in transformed.tensors().values())
     if not finite or reach > MAX_REACH or (before > 0.0 and reach < 1.0 / MAX_REACH):
         raise InputError(
-            "in that world the scene leaves the range of the file's single precision",
-            hint="export it in the normalised world (without --world input)",
+            "the coordinates of the scene in that world exceed the range of float32",
+            hint="export the scene in the normalised world (without --world input)",
         )
-    return replace(scene, gaussians=moved)
+    return replace(scene, gaussians=transformed)
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] w x y z; normalises them, 0 is the identity."""
+    """Return the rotation matrices [N, 3, 3] of quaternions w x y z [N, 4] of any norm (zero: identity)."""
     unit = torch.nn.functional.normalize(quaternions, dim=-1, eps=QUATERNION_EPSILON)
     w, x, y, z = unit.unbind(-1)
     rows = [
@@ -105,7 +115,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:
-    """The first ``count`` real spherical harmonics [N, count] of unit directions [N, 3]."""
+    """Evaluate the first ``count`` real spherical harmonics [N, count] at unit directions [N, 3]."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     c1, c2, c3 = SH_C1, SH_C2, SH_C3
@@ -131,14 +141,19 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 
 
 def sh_rotation(rotation: Tensor, count: int) -> Tensor:
-    """The matrix that takes the first ``count`` SH coefficients of f to those of d -> f(rotationᵀ d).
+    """Return the matrix that maps the SH coefficients of a function f to those of d -> f(rotationᵀ d).
 
-    Rotation keeps each degree to itself, so the turned function is again a sum of the same basis; its
-    coefficients follow from its values in a few directions, exactly up to rounding.
+    A rotated harmonic is a sum of harmonics of the same degree. The coefficients therefore follow exactly, up
+    to rounding, from the values in enough directions (least squares).
 
-    rotation: [3, 3] float64; returns [count, count] float64.
+    Args:
+        rotation: Rotation matrix, [3, 3] float64.
+        count: Number of coefficients: 1, 4, 9 or 16.
+
+    Returns:
+        Matrix [count, count] float64.
     """
-    # A Fibonacci sphere: evenly spread, so that the least squares are well conditioned.
+    # A Fibonacci sphere: its directions are evenly spread, so the least squares are well conditioned.
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
     z = 1.0 - 2.0 * index / _DIRECTIONS
     angle = index * math.pi * (3.0 - math.sqrt(5.0))
@@ -151,7 +166,7 @@ def sh_rotation(rotation: Tensor, count: int) -> Tensor:
 
 
 def _multiply(first: Tensor, second: Tensor) -> Tensor:
-    """Hamilton product of one quaternion w x y z with many: by ``second`` [N, 4], then by ``first`` [4]."""
+    """Return the Hamilton products [N, 4] of ``first`` [4] and ``second`` [N, 4]."""
     w, x, y, z = first
     matrix = torch.stack(
         [
@@ -165,11 +180,19 @@ def _multiply(first: Tensor, second: Tensor) -> Tensor:
 
 
 def orient_up(first: Camera, up: str) -> dict[str, Any]:
-    """Scale, rotation [3, 3] and translation [3] from the normalised world to one with ``up`` of `UP`, in
-    which ``first`` stands at the origin and looks ahead. Up stays up, whatever its pitch and roll.
+    """Return the rigid transform from the normalised world (y down) to a world with another up axis.
+
+    In the new world ``first`` is at the origin and looks ahead; its pitch and roll do not affect the up axis.
+
+    Args:
+        first: First camera of the capture.
+        up: Up axis, a key of `UP`.
+
+    Returns:
+        Arguments of `transform_scene`: scale, rotation and translation.
     """
     ahead = first.world_to_camera[2, :3] * [1.0, 0.0, 1.0]
     length = float(np.linalg.norm(ahead))
-    x, _, z = ahead / length if length > 1e-6 else (0.0, 0.0, 1.0)  # straight up or down: as it lies
+    x, _, z = ahead / length if length > 1e-6 else (0.0, 0.0, 1.0)  # a camera that looks up or down: no turn
     rotation = np.array(UP[up]) @ [[z, 0.0, -x], [0.0, 1.0, 0.0], [x, 0.0, z]]
     return {"scale": 1.0, "rotation": rotation, "translation": -rotation @ first.centre}

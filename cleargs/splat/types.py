@@ -1,4 +1,4 @@
-"""What the training and both back ends hand each other."""
+"""Data types that the training exchanges with the kernels."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from cleargs.splat.gaussians import Gaussians
 
 
 class Render(NamedTuple):
-    """One rendered view."""
+    """A rendered view."""
 
-    image: Tensor  # [H, W, 3] sRGB; not clamped above
+    image: Tensor  # [H, W, 3] sRGB, at least 0, may exceed 1
     alpha: Tensor  # [H, W] 1 - final transmittance
-    depth: Tensor | None  # [H, W] accumulated: the sum of weight * camera z, not divided by alpha
+    depth: Tensor | None  # [H, W] sum of weight * camera z, not divided by alpha; None: not requested
 
 
 Rate = float | Tensor
-"""One learning rate, or one per column of a parameter."""
+"""A learning rate, or one per column of a parameter."""
 
 
 class Reading(NamedTuple):
-    """What a step measured."""
+    """Measurements of a training step."""
 
-    loss: float
-    l1: float
+    loss: float  # weighted, without regularisation
+    l1: float  # mean absolute error, sRGB in [0, 1]
     ssim: float
-    psnr: float
+    psnr: float  # dB
 
 
 def group(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors of ``state`` whose names begin with ``prefix``, by the rest of their names."""
+    """Return the tensors whose names start with ``prefix``, by the rest of their names."""
     return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
 
 
 @dataclass
 class Moments:
-    """Adam's running means of the gradients and of their squares, by parameter name."""
+    """Running means of Adam by parameter name: of the gradients (first) and of their squares (second)."""
 
     first: dict[str, Tensor]
     second: dict[str, Tensor]
 
     @classmethod
     def zeros(cls, gaussians: Gaussians) -> Moments:
-        """Fresh moments for these parameters."""
+        """Return moments of zero for these parameters."""
         tensors = gaussians.tensors()
         return cls(
             {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
@@ -55,11 +55,11 @@ class Moments:
 
     @classmethod
     def of_state(cls, state: dict[str, Tensor]) -> Moments:
-        """Those that `state` gave, among whatever else is in ``state``."""
+        """Return the moments in a training state, which may hold other tensors as well."""
         return cls(group(state, "first."), group(state, "second."))
 
     def state(self) -> dict[str, Tensor]:
-        """Them for a ``state.safetensors``, by ``first.NAME`` and ``second.NAME``."""
+        """Return the moments as tensors of a training state, named ``first.NAME`` and ``second.NAME``."""
         return {
             f"{prefix}.{name}": tensor
             for prefix, group in (("first", self.first), ("second", self.second))
@@ -67,7 +67,7 @@ class Moments:
         }
 
     def to(self, device: torch.device) -> Moments:
-        """A copy of them on a device."""
+        """Return a copy on a device."""
         first, second = (
             {name: tensor.to(device, copy=True) for name, tensor in group.items()}
             for group in (self.first, self.second)

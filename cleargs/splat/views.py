@@ -1,4 +1,4 @@
-"""What a training looks at: views (a camera, an image, a weight) and the bounded cache of their images."""
+"""Training views (camera, image, weight), and a cache of their images with a memory limit."""
 
 from __future__ import annotations
 
@@ -18,38 +18,40 @@ from cleargs.splat.camera import Camera
 from cleargs.types import AnyImage, MaskBool
 
 UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
-"""Side in pixels of the blocks of a frame that no training sees, and of the cells that have one each: 1 %."""
+"""Side of the blocks that no training sees, and of the cells with one block each, px: 1 % of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """One image that a scene should explain."""
+    """An image that supervises the training."""
 
     frame_id: int
     camera: Camera
     weight: float
-    """Factor on the loss: the RVA weight w_i of a real frame."""
+    """Factor on the loss: the RVA weight w_i of a raw frame."""
     kind: Literal["real", "pseudo"]
-    """A captured frame, or a repaired one."""
+    """A raw frame (real), or its repair (pseudo)."""
     load: Callable[[], tuple[AnyImage, MaskBool | None]]
-    """Gives image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and mask [H, W] (True counts; None: all do).
-    Called when first needed, and again when the cache could not keep the image."""
+    """Function that returns the image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and the mask [H, W] (True:
+    the pixel counts) or None. The cache calls it when it needs the image, and again if it could not keep
+    it."""
 
 
 def require_views(views: Sequence[TrainingView]) -> None:
-    """Raise InputError when there is nothing to train on."""
+    """Raise InputError if there are no views."""
     if not views:
         raise InputError(
-            "no frame is left to train on: every weight is 0",
+            "there are no frames to train on: all weights are 0",
             hint="lower rva.tau_R, or use every frame with --set rva.enabled=false",
         )
 
 
 def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
-    """The pixels [H, W] of a frame, and of its repairs, that no training sees; they follow from ``frame_id``.
+    """Return the pixels of a frame and of its repairs that no training sees, True, [H, W].
 
-    How well a scene shows them says how good it is without a frame held out. They lie in blocks, since a
-    pixel alone is known from its neighbours. An image of less than two blocks a side has none.
+    They measure the quality of a scene without held-out frames. They form blocks, because the neighbours of a
+    single pixel reveal its colour. The positions are random, with ``frame_id`` as seed. Images with a side of
+    less than two blocks have none.
     """
     unseen = np.zeros((height, width), np.bool_)
     if min(height, width) < 2 * UNSEEN_BLOCK:
@@ -67,14 +69,16 @@ def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
 
 
 class ImageCache:
-    """Decoded images within a limit of bytes, at one scale at a time.
+    """Cache of decoded images with a memory limit, at one scale at a time.
 
-    For a training (``training``) the masks leave out the `unseen_pixels`.
+    Images are stored as uint8, or as float16 if they were float32. Images that do not fit pass through the
+    same types, so that results do not depend on the limit. An image that fits stays: replacing the oldest
+    would reduce the hit rate in shuffled epochs.
 
-    An image is held as it was loaded (uint8), or as half floats where it was float32, and always passes
-    through that form, so that results do not depend on what fitted. What fits first stays: under the
-    trainer's shuffled epochs dropping the oldest would only lower the share of hits. Images lie on
-    ``device``.
+    Args:
+        limit_bytes: Memory limit of the stored images and masks.
+        device: Device of the images.
+        training: True: masks exclude the `unseen_pixels`.
     """
 
     def __init__(
@@ -83,22 +87,22 @@ class ImageCache:
         self._limit = limit_bytes
         self._training = training
         self._device = torch.device(device)
-        # A tensor, since a GPU multiplies by the reciprocal of a number, which is not the same.
+        # A tensor: a GPU divides by a number by multiplying with its reciprocal, which rounds differently.
         self._white = torch.tensor(255.0, device=self._device)
         self._used = 0
         self._factor = 1.0
-        self._held: dict[TrainingView, tuple[Tensor, Tensor | None]] = {}
+        self._images: dict[TrainingView, tuple[Tensor, Tensor | None]] = {}
         self._scratch: dict[tuple[int, int], Tensor] = {}
 
     def get(self, view: TrainingView, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
-        """Image [H, W, 3] float32 and mask [H, W] (or None) of a view, resampled by ``factor``.
+        """Return image [H, W, 3] float32 sRGB and mask [H, W] or None of a view, resampled by ``factor``.
 
-        The image lies in a buffer of the cache, and is valid until the next call.
+        The image is a buffer of the cache, valid until the next call.
         """
         if factor != self._factor:
-            self._held.clear()
+            self._images.clear()
             self._used, self._factor = 0, factor
-        entry = self._held.get(view)
+        entry = self._images.get(view)
         if entry is None:
             pixels, counts = _prepare(view, factor, self._training)
             entry = (
@@ -107,7 +111,7 @@ class ImageCache:
             )
             size = pixels.nbytes + (0 if counts is None else counts.nbytes)
             if self._used + size <= self._limit:
-                self._held[view] = entry
+                self._images[view] = entry
                 self._used += size
         stored, mask = entry
         height, width = stored.shape[:2]
@@ -122,15 +126,15 @@ class ImageCache:
 def _prepare(
     view: TrainingView, factor: float, training: bool
 ) -> tuple[NDArray[np.generic], MaskBool | None]:
-    """Load a view and resample it by pixel area; a reduced pixel counts when every pixel under it does."""
+    """Load a view and resample it by pixel area; a reduced pixel counts if all pixels under it count."""
     image, mask = view.load()
     camera = view.camera.scaled(factor)
     expected = (view.camera.height, view.camera.width)
     if image.shape != (*expected, 3) or (mask is not None and mask.shape != expected):
         raise StageError(
-            f"the image of frame {view.frame_id} is {image.shape[1]}x{image.shape[0]}, "
-            f"its camera {expected[1]}x{expected[0]}",
-            hint="run ingest again with --force ingest",
+            f"the image of frame {view.frame_id} has {image.shape[1]}x{image.shape[0]} pixels, "
+            f"but its camera has {expected[1]}x{expected[0]}",
+            hint="repeat ingest with --force ingest",
         )
     if training and (unseen := unseen_pixels(view.frame_id, *expected)).any():
         mask = ~unseen if mask is None else mask & ~unseen

@@ -1,1 +1,1 @@
-"""Synthetic handheld captures with known truth: a procedural room, a handheld path, camera degradations."""
+"""Synthetic handheld captures with ground truth: a procedural room, a handheld path, camera degradations."""

@@ -1,4 +1,4 @@
-"""How far the image moves: the blur of an exposure, the skew of a readout, the shutter that samples both."""
+"""Image motion of a frame: length of the blur, skew of a rolling shutter, and poses that sample both."""
 
 from __future__ import annotations
 
@@ -14,48 +14,50 @@ from cleargs.synth.optics import MIN_SAMPLES, Lens, Shutter
 from cleargs.synth.path import HandheldPath
 from cleargs.types import ArrayF64
 
-GRID = (24, 14)
-"""Columns and rows of the points whose motion is followed."""
-INSTANTS = 33
-"""Poses that trace the motion within an exposure."""
-FASTEST = 0.9
-"""Quantile of the image points whose motion sets the number of samples: these move by at most a pixel from
-sample to sample, so that, with the pixel's own width, no ghost steps show."""
+TRACK_GRID = (24, 14)
+"""Columns and rows of the image points that are tracked."""
+TRACK_POSES = 33
+"""Number of poses at which points are tracked within an exposure."""
+FAST_QUANTILE = 0.9
+"""Quantile of the motions of the image points that sets the number of samples. Points up to it move by at
+most one pixel between samples, so that no separate copies are visible."""
 ROW_STEP = 0.25
-"""By how many pixels at most the rows of one pose differ from their own, twice: rows share poses in steps
-of that size."""
+"""Image motion in pixels between the poses that rows of a rolling shutter share. A row differs from its exact
+pose by at most half of it."""
 
 
 @dataclass(frozen=True)
 class SimulatedMotion:
-    """One frame's surroundings in time: what an exposure about its middle would smear."""
+    """Motion of the image around the time of one frame."""
 
     path: HandheldPath
     time: float
     """Middle of the exposure, seconds."""
-    points: ArrayF64  # [P, 3] that the middle pose sees, in the world
+    points: ArrayF64  # [P, 3] visible from the middle pose, world coordinates
     lens: Lens
 
     def blur(self, exposure: float) -> float:
-        """Mean length in pixels of the points' paths in the image during ``exposure`` seconds."""
+        """Return the mean path length of the points in the image during ``exposure`` seconds, in pixels."""
         return float(self._lengths(exposure).mean())
 
     def skew(self, readout: float) -> float:
-        """Mean distance in pixels between the points as the first and as the last row's pose sees them."""
+        """Return the mean image distance of the points between the first and last row's poses, in pixels."""
         return float(self._skews(readout).mean())
 
     def shutter(self, exposure: float, readout: float) -> Shutter:
-        """The poses of the path that an exposure and a readout (seconds, of all rows) sample.
+        """Return the poses of the path that sample an exposure.
 
-        Every row integrates its own exposure; the middle row's is centred on ``time``.
+        Args:
+            exposure: Exposure time of each row, seconds. That of the middle row is centred on ``time``.
+            readout: Time from the first to the last row, seconds; 0 for a global shutter.
         """
         height = self.lens.height
-        blur = float(np.quantile(self._lengths(exposure), FASTEST)) if exposure > 0 else 0.0
+        blur = float(np.quantile(self._lengths(exposure), FAST_QUANTILE)) if exposure > 0 else 0.0
         samples = max(MIN_SAMPLES, math.ceil(blur))
         tick, stride = exposure / samples, int(exposure > 0)
         row = np.zeros(height, np.intp)
         if readout > 0:
-            skew = float(np.quantile(self._skews(readout), FASTEST))
+            skew = float(np.quantile(self._skews(readout), FAST_QUANTILE))
             row_step = readout / max(1, math.ceil(skew / ROW_STEP))
             stride = math.ceil(tick / row_step)
             tick = tick / stride if stride else row_step
@@ -66,7 +68,7 @@ class SimulatedMotion:
         return Shutter(self.path.poses(times), place.reshape(index.shape), times)
 
     def _lengths(self, exposure: float) -> ArrayF64:
-        times = self.time + exposure * np.linspace(-0.5, 0.5, INSTANTS)
+        times = self.time + exposure * np.linspace(-0.5, 0.5, TRACK_POSES)
         return np.asarray(np.linalg.norm(np.diff(self._tracks(times), axis=0), axis=2).sum(0))
 
     def _skews(self, readout: float) -> ArrayF64:
@@ -74,17 +76,24 @@ class SimulatedMotion:
         return np.asarray(np.linalg.norm(last - first, axis=1))
 
     def _tracks(self, times: ArrayF64) -> ArrayF64:
-        """Image positions [T, P, 2] in pixels."""
+        """Return image positions [T, P, 2] in pixels, relative to the principal point."""
         poses = self.path.poses(times)
         local = np.einsum("tpk,tkj->tpj", self.points - poses[:, None, :, 3], poses[:, :, :3])
         focal = np.array([self.lens.fx, self.lens.fy])
         return np.asarray(focal * local[..., :2] / np.maximum(local[..., 2:], 1e-6), np.float64)
 
 
-def follow(path: HandheldPath, time: float, depth: ArrayF64, lens: Lens) -> SimulatedMotion:
-    """The motion about a frame whose view at ``time`` has ``depth`` [H, W] (0 where there is nothing)."""
-    columns = (np.arange(GRID[0]) + 0.5) / GRID[0] * lens.width
-    rows = (np.arange(GRID[1]) + 0.5) / GRID[1] * lens.height
+def track_motion(path: HandheldPath, time: float, depth: ArrayF64, lens: Lens) -> SimulatedMotion:
+    """Prepare the points to track for a frame.
+
+    Args:
+        path: Path of the camera.
+        time: Middle of the exposure, seconds.
+        depth: Depth at that time [H, W], world units; 0 without a surface.
+        lens: Lens of the camera.
+    """
+    columns = (np.arange(TRACK_GRID[0]) + 0.5) / TRACK_GRID[0] * lens.width
+    rows = (np.arange(TRACK_GRID[1]) + 0.5) / TRACK_GRID[1] * lens.height
     x, y = np.meshgrid(columns, rows)
     z = depth[y.astype(int), x.astype(int)]
     rays = np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy, np.ones_like(x)], -1)
@@ -93,10 +102,11 @@ def follow(path: HandheldPath, time: float, depth: ArrayF64, lens: Lens) -> Simu
     return SimulatedMotion(path, time, (rays * z[..., None])[seen] @ pose[:, :3].T + pose[:, 3], lens)
 
 
-def duration_for(pixels: float, motion: Callable[[float], float]) -> float:
-    """The duration in seconds over which ``motion(duration)``, rising, comes to ``pixels``; 0 for none.
+def solve_duration(pixels: float, motion: Callable[[float], float]) -> float:
+    """Return the duration in seconds for which the increasing function ``motion`` is ``pixels``; 0 for 0.
 
-    Raises InputError when a minute does not suffice.
+    Raises:
+        InputError: if it is longer than a minute.
     """
     if pixels <= 0:
         return 0.0
@@ -105,7 +115,7 @@ def duration_for(pixels: float, motion: Callable[[float], float]) -> float:
         longest *= 2
         if longest > 60:
             raise InputError(
-                "the camera hardly moves: its frames cannot be blurred",
+                "the camera moves too little for blurred frames",
                 hint="choose the protocol sharp, or cameras that move",
             )
     return float(brentq(lambda duration: motion(duration) - pixels, 0.0, longest, xtol=1e-7))

@@ -1,6 +1,6 @@
-"""Lens, shutter and aperture of a camera, and what it looks at: any world that it can be exposed in.
+"""Lens, shutter and aperture of a camera, and the protocol of worlds that it can film.
 
-Protocols and degradations know a world only through `World`. Poses are camera to world [3, 4], OpenCV axes.
+Poses are camera to world [3, 4] with OpenCV axes.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from cleargs.types import ArrayF64
 
 MIN_SAMPLES = 8
-"""Samples of a picture without motion: they also smooth the edges of a world that is sampled by rays."""
+"""Samples per image without motion. More than one is needed for anti-aliasing in a ray caster."""
 FIELD_OF_VIEW = math.radians(65)
-"""Across the longer side, as a phone's main camera."""
+"""Field of view of the longer side, as of a phone's main camera."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Pinhole intrinsics in pixels, pixel centres at + 0.5."""
+    """Pinhole intrinsics in pixels; pixel centres are at + 0.5."""
 
     width: int
     height: int
@@ -34,35 +34,36 @@ class Lens:
 
 
 def phone_lens(width: int, height: int) -> Lens:
-    """The main camera of a phone."""
+    """Return the lens of a phone's main camera."""
     focal = max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
     return Lens(width, height, focal, focal, width / 2, height / 2)
 
 
 @dataclass(frozen=True)
 class Shutter:
-    """Which pose each row of the sensor sees in each sample of its exposure.
+    """Poses of the rows of the sensor in the S samples of an exposure.
 
-    Global shutter: all rows of a sample share a pose. Rolling shutter: a window that slides over the poses.
+    With a global shutter all rows of a sample have the same pose. With a rolling shutter each row has its
+    window of poses.
     """
 
     poses: ArrayF64  # [T, 3, 4] in the order of time
     index: NDArray[np.intp]  # [S, H] into poses
-    times: ArrayF64 = field(default_factory=lambda: np.zeros(1))  # [T or 1] seconds: for what moves by itself
+    times: ArrayF64 = field(default_factory=lambda: np.zeros(1))  # [T or 1] seconds, for moving objects
 
     @property
     def samples(self) -> int:
         return len(self.index)
 
 
-def still(pose: ArrayF64, height: int) -> Shutter:  # [3, 4]
-    """An instant: one pose for all rows."""
+def instant_shutter(pose: ArrayF64, height: int) -> Shutter:  # [3, 4]
+    """Return a shutter without motion: one pose for all rows and samples."""
     return Shutter(pose[None], np.zeros((MIN_SAMPLES, height), np.intp))
 
 
 @dataclass(frozen=True)
 class Aperture:
-    """A thin lens: the points of the aperture that the samples look through, one a sample."""
+    """A thin lens: one point of the aperture per sample."""
 
     points: ArrayF64 = field(default_factory=lambda: np.zeros((1, 2)))  # [S or 1, 2] world units
     focus: float = 1.0
@@ -73,23 +74,23 @@ PINHOLE = Aperture()
 
 
 class World(Protocol):
-    """Something to photograph."""
+    """A scene that can be rendered."""
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
-        """The mean over the samples in linear light, [H, W, 3]; 1 is sensor white."""
+        """Return the mean of the samples [H, W, 3] in linear light; 1 is sensor white."""
 
     def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
-        """Distance along the optical axis through the pixel centres, [H, W]; 0 where there is nothing."""
+        """Return the camera z at the pixel centres [H, W], world units; 0 without a surface."""
 
 
 def low_discrepancy(count: int) -> ArrayF64:
-    """[count, 2] points that cover the unit square evenly (Roberts' R2 sequence)."""
+    """Return points [count, 2] that cover the unit square evenly (Roberts' R2 sequence)."""
     steps = np.array([0.7548776662466927, 0.5698402909980532])
     return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0, np.float64)
 
 
 def disc(count: int, radius: float) -> ArrayF64:
-    """[count, 2] points that cover a disc evenly (sunflower spiral)."""
+    """Return points [count, 2] that cover a disc evenly (sunflower spiral)."""
     number = np.arange(count) + 0.5
     angle = number * math.pi * (3 - math.sqrt(5))
     unit = np.sqrt(number / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -104,6 +105,8 @@ def distorted(
     """Return what a lens with distortion makes of the image of ``lens``, which has none.
 
     Args:
+        light: image in linear light.
+        lens: lens of ``light``.
         coefficients: k1, k2, p1 and p2 of OpenCV's model. The ray of each pixel is found by fixed-point
             iteration. Pixels whose ray is outside the image repeat its border.
     """

@@ -1,8 +1,7 @@
-"""A handheld walk: a smooth course, walked at an uneven pace by a hand that trembles and swings.
+"""A handheld walk: a smooth course at an uneven pace, with tremor and swings of the hand.
 
-A course leads around the room's table from share 0 to share 1.
-One path gives every pose, those within an exposure included: blur and skew are what its speed makes of the
-exposure and the readout, and so frame quality varies along it. Poses are camera to world with OpenCV axes.
+The path is continuous in time and also gives the poses within an exposure. Its speed determines blur and
+rolling-shutter skew, so that frame quality varies along it. Poses are camera to world with OpenCV axes.
 """
 
 from __future__ import annotations
@@ -19,34 +18,36 @@ from cleargs.synth.optics import Aperture, Lens, Shutter, World
 from cleargs.types import ArrayF64
 
 UP = np.array([0.0, 1.0, 0.0])
+"""The up axis of the world."""
 DEGREES_PER_FRAME, MAX_DEGREES = 4.0, 150.0
+"""Angle of an orbit per frame, and its maximum."""
 
 
 class Course(Protocol):
-    """The drift of a walk, without pauses or tremor."""
+    """The smooth course of a walk, without pauses or tremor."""
 
     def poses(self, shares: ArrayF64) -> ArrayF64:
-        """Poses [T, 3, 4] at ``shares`` [T] of the way; a little beyond 0 and 1 is allowed."""
+        """Return poses [T, 3, 4] at ``shares`` [T] of the course, from 0 to 1 or slightly outside."""
 
     def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
-        """A pose [3, 4] off the course, near ``share``, that looks at what the course looks at."""
+        """Return a random pose [3, 4] off the course, near ``share``, with about the same target."""
 
 
 @dataclass(frozen=True)
 class SceneSetup:
-    """Where a capture is made."""
+    """World, course and lens of a capture."""
 
     name: str
     world: World
     course: Course
     lens: Lens
     film: Callable[[Shutter, Lens, Aperture], tuple[ArrayF64, ArrayF64]] | None = None
-    """The world with something that moves in it: light, and the share of the exposure in which a pixel sees
-    it."""
+    """Renders the world with a moving object. Returns linear light [H, W, 3], and per pixel [H, W] the share
+    of the exposure that sees the object. None: no such object."""
 
 
 def look_at(centres: ArrayF64, target: ArrayF64) -> ArrayF64:  # [..., 3], [3]
-    """Poses [..., 3, 4] at ``centres`` that look at ``target``, level in a world with y up."""
+    """Return level poses [..., 3, 4] at ``centres`` that look at ``target``, in a world with y up."""
     forward = target - centres
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, UP)
@@ -55,22 +56,22 @@ def look_at(centres: ArrayF64, target: ArrayF64) -> ArrayF64:  # [..., 3], [3]
 
 
 class Orbit:
-    """An arc around ``focus`` at changing height and distance, in metres.
+    """An arc around ``focus`` at varying height and distance, in metres.
 
-    ``frames`` neighbours on it are about 4 degrees apart, over at most 150 degrees.
+    Frames are about `DEGREES_PER_FRAME` apart. The arc covers at most `MAX_DEGREES`.
     """
 
     def __init__(self, focus: ArrayF64, frames: int, seed: int) -> None:
         self._focus = focus
         self._arc = float(np.radians(min(DEGREES_PER_FRAME * frames, MAX_DEGREES)))
         rng = np.random.default_rng([seed, Stream.ORBIT])
-        self._phases = rng.uniform(0, 2 * np.pi, 2)  # of distance and height
+        self._phases = rng.uniform(0, 2 * np.pi, 2)  # phases of distance and height, radians
 
     def poses(self, shares: ArrayF64) -> ArrayF64:
         return look_at(self._centres(shares), self._focus)
 
     def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
-        """Nearer or farther, higher or lower: off by up to one and a half frames' way in each axis."""
+        """Return a pose off the course by up to 0.22 m per axis, about 1.5 times the distance of frames."""
         centre = self._centres(np.array([share]))[0] + rng.uniform(-0.22, 0.22, 3)
         return look_at(centre, self._focus + rng.uniform(-0.08, 0.08, 3))
 
@@ -83,31 +84,33 @@ class Orbit:
 
 
 FPS = 6.0
-"""Frames a second: what a walk of a few degrees a frame needs."""
+"""Frames per second, for a walk of a few degrees per frame."""
 FRAMES_PER_PAUSE = 6.0
-PAUSE = 0.8
-"""The pace lies between 1 - PAUSE and 1 + PAUSE of its mean."""
+"""Mean number of frames between slow parts of the walk."""
+PACE_AMPLITUDE = 0.8
+"""The pace is between 1 - PACE_AMPLITUDE and 1 + PACE_AMPLITUDE of its mean."""
 TREMOR_HZ = (1.0, 12.0)
 TREMOR_RADIANS = 0.005
-"""Deviation of the aim, about a third of a degree, as of a hand that walks and tries to hold still."""
+"""Standard deviation of the tremor, about a third of a degree, as of a walking person with a steady hand."""
 FRAMES_PER_SWING = 4.0
 SWING_SECONDS = 0.12
 SWING_RADIANS = (0.035, 0.085)
 FRAMES_PER_STRETCH = 32
+"""A stretched walk has one shaky stretch per this many frames."""
 STRETCH_SHARE = 0.375
-"""Of every `FRAMES_PER_STRETCH` frames of a stretched walk this share, in one piece, is shaky."""
-SHAKING = 12.0
-"""How many times larger the tremor is there: as of a hand in a hurry. It swings only there."""
-STRETCH_EDGE = 1 / FPS
-"""Seconds over which the shaking comes and goes."""
+"""Share of these frames in the stretch."""
+SHAKE_GAIN = 12.0
+"""Factor of the tremor within a stretch, as of a hand in a hurry. A stretched walk has swings only there."""
+STRETCH_EDGE_S = 1 / FPS
+"""Seconds over which the shaking rises and falls."""
 
 
 class Hand:
-    """Turns of the aim about the camera's axes. Tremor of position is left out: at more than a step's
-    distance the turn moves the image far more.
+    """Rotation of the camera by the hand.
 
-    The tremor has the same speed in each band from 1 to 12 Hz, and the hand swings every few frames.
-    ``stretched``: and it shakes for stretches in one piece, one in every `FRAMES_PER_STRETCH` frames.
+    The tremor has the same speed in each band from 1 to 12 Hz, and the hand swings every few frames. If
+    ``stretched``, it shakes strongly in stretches of consecutive frames. Tremor of the position is left out,
+    since rotation moves the image of surfaces more than a step away much more.
     """
 
     def __init__(self, duration: float, seed: int, *, stretched: bool = False) -> None:
@@ -126,55 +129,57 @@ class Hand:
         free = np.random.default_rng([seed, Stream.SHAKY_STRETCHES]).uniform(0, 1 - STRETCH_SHARE, count)
         starts = np.arange(count) + free
         self.stretches = np.stack([starts, starts + STRETCH_SHARE], 1) * duration / max(count, 1)
-        """Seconds [stretches, 2] from and to which the hand shakes."""
+        """Begin and end [stretches, 2] of each stretch, seconds."""
 
     def turns(self, times: ArrayF64) -> ArrayF64:  # [T]
-        """Rotation vectors [T, 3]."""
+        """Return rotation vectors [T, 3] about the camera's axes, radians."""
         waves = np.sin(2 * np.pi * self._frequencies * times[:, None, None] + self._phases)
         tremor = (self._amplitudes * waves).sum(1)
-        # Out to one side, through the middle at full speed, back from the other: 1 at the extremes.
+        # A swing goes to one side, back through the middle at full speed, to the other side, and back. It is
+        # 1 at the extremes.
         share = (times[:, None] - self._swing_times) / SWING_SECONDS
         swings = share * np.exp((1 - share**2) / 2)
         if len(self.stretches):
             strength = self.shake_strength(times)[:, None]
-            tremor, swings = tremor * (1 + (SHAKING - 1) * strength), swings * strength
+            tremor, swings = tremor * (1 + (SHAKE_GAIN - 1) * strength), swings * strength
         return np.asarray(tremor + swings @ self._swing_turns, np.float64)
 
     def shake_strength(self, times: ArrayF64) -> ArrayF64:  # [T] seconds
-        """1 [T] within a stretch, 0 outside."""
+        """Return the strength of the shaking [T]: 1 within a stretch, 0 outside."""
         start, end = self.stretches.T
         inside = np.minimum(times[:, None] - start, end - times[:, None])
-        share = np.clip(inside / STRETCH_EDGE + 0.5, 0, 1)
+        share = np.clip(inside / STRETCH_EDGE_S + 0.5, 0, 1)
         return np.asarray((share**2 * (3 - 2 * share)).sum(1))
 
 
 class HandheldPath:
-    """Where the camera is at any time of a walk along ``course`` that takes ``frames`` frames at `FPS`; for
-    ``stretched`` see `Hand`.
+    """Pose of the camera at any time of a walk along a course.
+
+    The walk takes ``frames`` frames at `FPS`. For ``stretched`` see `Hand`.
     """
 
     def __init__(self, course: Course, frames: int, seed: int, *, stretched: bool = False) -> None:
         self.duration = frames / FPS
-        """Seconds."""
+        """Duration in seconds."""
         self.hand = Hand(self.duration, seed, stretched=stretched)
         self._course = course
         self._pauses = max(1, round(frames / FRAMES_PER_PAUSE))
         rng = np.random.default_rng([seed, Stream.WALK])
-        self._phase = rng.uniform(0, 2 * np.pi)  # of the pace, radians
+        self._phase = rng.uniform(0, 2 * np.pi)  # phase of the pace, radians
 
     def poses(self, times: ArrayF64) -> ArrayF64:  # [T] seconds
-        """Camera to world [T, 3, 4] with OpenCV axes."""
+        """Return poses [T, 3, 4], camera to world with OpenCV axes."""
         poses = self._course.poses(self.progress(times))
         turns = Rotation.from_rotvec(self.hand.turns(times)).as_matrix()
         return np.concatenate([poses[:, :, :3] @ turns, poses[:, :, 3:]], 2)
 
     def progress(self, times: ArrayF64) -> ArrayF64:
-        """Share of the course walked: its speed is 1 + PAUSE cos, so that frames bunch at the pauses."""
+        """Return the share of the course [T] at ``times``, with a speed of 1 + PACE_AMPLITUDE cos(phase)."""
         share, turn = times / self.duration, 2 * np.pi * self._pauses
         wave = np.sin(turn * share + self._phase) - np.sin(self._phase)
-        return np.asarray(share + PAUSE / turn * wave, np.float64)
+        return np.asarray(share + PACE_AMPLITUDE / turn * wave, np.float64)
 
 
 def frame_times(frames: int) -> ArrayF64:
-    """Middles of the exposures, seconds [frames]."""
+    """Return the middles of the exposures [frames], in seconds."""
     return np.asarray((np.arange(frames) + 0.5) / FPS, np.float64)

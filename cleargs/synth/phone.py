@@ -1,7 +1,7 @@
-"""What a phone makes of a frame: its tone curve, its sharpening, its automatic exposure, its video codec.
+"""Image processing of a phone: tone curve, sharpening, automatic exposure and video codec.
 
-The look (tone curve and sharpening) is the camera's, not a fault: the truth of a capture has it too. What the
-exposure and the codec add is in the frames alone.
+Tone curve and sharpening are the look of the camera, not a fault. The ground truth of a capture has them as
+well. Effects of exposure and codec are in the frames only.
 """
 
 from __future__ import annotations
@@ -21,40 +21,41 @@ from cleargs.random_streams import Stream
 from cleargs.types import ArrayF64, ImageU8
 
 NOISE = 1.5 / 255
-"""Deviation of the sensor noise at mid grey, sRGB units: a phone's small pixels, indoors."""
+"""Standard deviation of the sensor noise at mid grey, sRGB units, for a phone's small pixels indoors."""
 BITS_PER_PIXEL = 0.6
-"""Rate of the video, held over a second. The decoded frames lie some 35 dB from the uncoded ones: visible,
-as in a phone's video, which has 0.3 bits at 1080p but whose frames are larger and closer in time."""
+"""Mean rate of the video over a second. The PSNR of decoded frames is about 35 dB, so that artifacts are
+visible as in a phone's video. That has 0.3 bits per pixel at 1080p, but its frames are larger and closer in
+time."""
 SHARPENING_SIGMA = 1.0
-"""Deviation of the Gaussian that separates the detail to sharpen, pixels of the image."""
-SPOT = 8
-"""Power of the sine that weights the metered picture: most weight lies in the middle third of each side."""
-LAG = 0.6
-"""Seconds in which automatic exposure covers all but 1 / e of a change."""
-METERED = 0.8
-"""Share of a change of brightness, in stops, that automatic exposure makes up for in the end."""
+"""Standard deviation of the Gaussian of the unsharp mask, pixels of the image."""
+SPOT_POWER = 8
+"""Power of the sine window of the light meter. Most weight is in the middle third of each side."""
+LAG_S = 0.6
+"""Time constant of automatic exposure, seconds."""
+METERING_SHARE = 0.8
+"""Share of a change of brightness, in stops, that automatic exposure compensates in the end."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a camera renders light: an S-shaped tone curve, then an unsharp mask on luma, on sRGB values."""
+    """Look of a camera: an S-shaped tone curve, then an unsharp mask on luma. Both use sRGB values."""
 
     contrast: float = 0.0
-    """Steepness of the logistic curve; 0: none."""
+    """Steepness of the logistic curve; 0: no curve."""
     pivot: float = 0.5
-    """Where the curve is steepest, sRGB in [0, 1]: contrast rises there and falls towards black and white."""
+    """sRGB value in [0, 1] where the curve is steepest."""
     sharpening: float = 0.0
-    """Share of the luma's fine detail that is added to all channels."""
+    """Factor of the luma's fine detail that is added to all channels."""
 
     def tone(self, value: ArrayF64) -> ArrayF64:
-        """The curve: [0, 1] onto [0, 1], rising."""
+        """Apply the tone curve, which increases from 0 at 0 to 1 at 1."""
         if not self.contrast:
             return value
         low, high = (1 / (1 + math.exp(-self.contrast * (end - self.pivot))) for end in (0.0, 1.0))
         return np.asarray((1 / (1 + np.exp(-self.contrast * (value - self.pivot))) - low) / (high - low))
 
     def apply(self, image: ArrayF64) -> ArrayF64:  # [H, W, 3] sRGB in [0, 1]
-        """sRGB in [0, 1]."""
+        """Apply the look. Return sRGB [H, W, 3] in [0, 1]."""
         image = self.tone(image)
         if not self.sharpening:
             return image
@@ -68,32 +69,35 @@ PLAIN = Look()
 
 
 def phone_look(seed: int) -> Look:
-    """The look of a phone: contrast up to a third higher in the middle tones, visible sharpening."""
+    """Return the look of a phone: up to a third more contrast in the middle tones, visible sharpening."""
     rng = np.random.default_rng([seed, Stream.PHONE_LOOK])
     return Look(rng.uniform(3.0, 4.5), rng.uniform(0.4, 0.5), rng.uniform(0.4, 0.7))
 
 
-def metered(light: ArrayF64) -> float:  # [H, W, 3] linear
-    """What the meter sees: the mean luminance, above 0, over a spot in the middle."""
+def metered_luminance(light: ArrayF64) -> float:  # [H, W, 3] linear
+    """Return the mean luminance over a spot in the middle of the image; it is above 0."""
     red, blue = LUMA["bt709"]
-    rows, columns = (np.sin(math.pi * (np.arange(size) + 0.5) / size) ** SPOT for size in light.shape[:2])
+    rows, columns = (
+        np.sin(math.pi * (np.arange(size) + 0.5) / size) ** SPOT_POWER for size in light.shape[:2]
+    )
     weight = rows[:, None] * columns
     mean = (light @ np.array([red, 1 - red - blue, blue]) * weight).sum() / weight.sum()
     return max(float(mean), 1e-6)
 
 
 def auto_exposure(
-    luminances: ArrayF64, step: float
-) -> ArrayF64:  # [F] of `metered`, seconds from frame to frame
-    """The gain of each frame in stops [F], of mean 0: it goes towards what the frame asks for, with `LAG`."""
-    wanted = -METERED * np.log2(luminances)
+    luminances: ArrayF64,  # [F] from `metered_luminance`
+    step: float,  # seconds between frames
+) -> ArrayF64:  # [F]
+    """Return the gain of each frame in stops, with mean 0. It follows the luminance with `LAG_S`."""
+    wanted = -METERING_SHARE * np.log2(luminances)
     gains = wanted.copy()
     for number in range(1, len(wanted)):
-        gains[number] = wanted[number] + (gains[number - 1] - wanted[number]) * math.exp(-step / LAG)
+        gains[number] = wanted[number] + (gains[number - 1] - wanted[number]) * math.exp(-step / LAG_S)
     return np.asarray(gains - gains.mean(), np.float64)
 
 
-def coded(path: Path, frames: Sequence[ImageU8], fps: float) -> list[ImageU8]:
-    """Write ``frames`` [H, W, 3] as the phone's video to ``path``, and give back what a player shows."""
+def encode_and_decode(path: Path, frames: Sequence[ImageU8], fps: float) -> list[ImageU8]:
+    """Write ``frames`` [H, W, 3] as the phone's video to ``path``, and return the decoded frames."""
     write_video(path, frames, fps, BITS_PER_PIXEL)
     return [frame for _, frame in decode_frames(path, read_timeline(path).pts)]

@@ -1,4 +1,4 @@
-"""What is wrong with each frame of a synthetic capture, by protocol name."""
+"""Protocols of synthetic captures: the degradation of each frame, by protocol name."""
 
 from __future__ import annotations
 
@@ -12,52 +12,52 @@ from scipy.spatial.transform import Rotation
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
 from cleargs.synth import phone
-from cleargs.synth.image_motion import SimulatedMotion, duration_for
+from cleargs.synth.image_motion import SimulatedMotion, solve_duration
 from cleargs.synth.path import FPS
 from cleargs.synth.phone import auto_exposure
 
 REFERENCE_WIDTH = 640
-"""Lengths in pixels are stated at this image width."""
+"""Image width, px, for which lengths in pixels are stated."""
 NOISE = 1.0 / 255
-"""Deviation of the sensor noise at mid grey of a well exposed frame, sRGB units."""
+"""Standard deviation of the sensor noise at mid grey in a well exposed frame, sRGB units."""
 SHARP_BLUR = 0.8
-"""Longest mean blur of a frame of `mixed` that counts as sharp, pixels."""
+"""Maximum blur of a sharp frame of `mixed`, pixels at `REFERENCE_WIDTH`."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """One way to spoil a capture. Lengths in pixels at `REFERENCE_WIDTH`.
+    """Degradation of a capture. Lengths are in pixels at `REFERENCE_WIDTH`.
 
-    One exposure and one readout time serve the whole capture, chosen so that the means over its frames are
-    as stated; how they vary from frame to frame is the walk's doing. ``shutter`` states the exposure itself.
+    Exposure and readout time are constant within a capture. They are chosen so that the means over the frames
+    are ``blur`` and ``skew``. Both vary between frames with the speed of the walk.
     """
 
     blur: float = 0.0
-    """Mean over the frames of the mean length of the motion path in the image; 0 for instants."""
+    """Mean length of the motion path in the image, over points and frames; 0: no motion blur."""
     shutter: float = 0.0
-    """Share of the time from frame to frame that the shutter is open for a row, in place of ``blur``."""
+    """Exposure time as a share of the time between frames; replaces ``blur``."""
     skew: float = 0.0
-    """Mean over the frames of the mean displacement between first and last row's pose; 0: global shutter."""
+    """Mean displacement between first and last row's poses, over points and frames; 0: global shutter."""
     rotation_noise: float = 0.0
-    """Deviation about each axis of the given poses' rotation error, degrees."""
+    """Standard deviation per axis of the rotation error of the given poses, degrees."""
     translation_noise: float = 0.0
-    """Deviation along each axis of the given poses' centre error, as a share of the capture's mean depth."""
+    """Standard deviation per axis of the error of the given camera centres, as a share of the mean depth."""
     focal_error: float = 0.0
     """Error of the given focal length, as a share of the true one."""
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1 and p2 of the lens (OpenCV's model), of which the input says nothing."""
     mixed: bool = False
-    """Faults by frame instead: see `_mixed`."""
+    """Use faults per frame instead: see `_mixed`."""
     jpeg: int | None = None
     """JPEG quality; None for lossless PNG."""
     stretched: bool = False
-    """Whether the hand shakes for stretches in one piece: see `cleargs.synth.path`."""
+    """The hand shakes in stretches of consecutive frames: see `cleargs.synth.path`."""
     phone: bool = False
-    """Whether a phone processes the frames and something moves in the room: see `cleargs.synth.phone`."""
+    """A phone processes the frames, and a balloon moves in the room: see `cleargs.synth.phone`."""
 
 
 PROTOCOLS: dict[str, Protocol] = {
-    "sharp": Protocol(),  # no fault but a little noise: the control that nothing may harm
+    "sharp": Protocol(),  # the control: only slight noise
     "mixed": Protocol(mixed=True, jpeg=92),
     "gs2e-slight": Protocol(blur=6),
     "gs2e-medium": Protocol(blur=12),
@@ -67,20 +67,20 @@ PROTOCOLS: dict[str, Protocol] = {
     "gsotm-rs": Protocol(skew=12),
     "gsotm-mb-rs": Protocol(blur=8, skew=12),
     "gsotm-pn": Protocol(rotation_noise=0.4, translation_noise=0.005),
-    # A depth sensor's camera and poses: 7-Scenes' focal length is 13 % off, its poses miss by 1.7 px.
+    # As with a depth sensor: the focal length of 7-Scenes is 13 % off, and its poses miss by 1.7 px.
     "camera": Protocol(
         rotation_noise=0.4,
         translation_noise=0.005,
         focal_error=0.06,
         distortion=(0.08, -0.03, 0.001, -0.001),
     ),
-    # Every fifth frame of a video of 30 a second whose shutter is open for 5/6 of the time.
+    # Every fifth frame of a video with 30 frames per second and a shutter that is open 5/6 of the time.
     "phone": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True),
 }
 
 
 def find_protocol(name: str) -> Protocol:
-    """The protocol called ``name``. Raises InputError where there is none."""
+    """Return the protocol called ``name``. Raise InputError if there is none."""
     if name not in PROTOCOLS:
         raise InputError(f"no protocol is called {name!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
     return PROTOCOLS[name]
@@ -88,31 +88,38 @@ def find_protocol(name: str) -> Protocol:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with one frame."""
+    """Degradation of one frame."""
 
     exposure: float = 0.0
-    """Seconds that the shutter is open for a row."""
+    """Exposure time of a row, seconds."""
     readout: float = 0.0
-    """Seconds from the first row's exposure to the last one's."""
+    """Time from the first row's exposure to the last one's, seconds."""
     defocus: float = 0.0
     """Mean radius of the blur disc, pixels of the image."""
     stops: float = 0.0
-    """Exposure error."""
+    """Exposure error, stops."""
     noise: float = NOISE
-    """Deviation of the sensor noise at mid grey, sRGB units."""
+    """Standard deviation of the sensor noise at mid grey, sRGB units."""
 
 
-def plan(
+def plan_faults(
     protocol: Protocol, motions: Sequence[SimulatedMotion], luminances: Sequence[float], seed: int
 ) -> list[Fault]:
-    """The fault of each frame of a walk; ``luminances`` is what each frame's meter sees, in linear light."""
+    """Choose the fault of each frame of a walk.
+
+    Args:
+        protocol: The protocol of the capture.
+        motions: Image motion of each frame.
+        luminances: `cleargs.synth.phone.metered_luminance` of each frame; used for automatic exposure.
+        seed: Seed of the random faults.
+    """
     scale = motions[0].lens.width / REFERENCE_WIDTH
     if protocol.mixed:
         return _mixed(motions, scale, np.random.default_rng([seed, Stream.MIXED_FAULTS]))
-    exposure = protocol.shutter / FPS or duration_for(
+    exposure = protocol.shutter / FPS or solve_duration(
         protocol.blur * scale, lambda time: float(np.mean([motion.blur(time) for motion in motions]))
     )
-    readout = duration_for(
+    readout = solve_duration(
         protocol.skew * scale, lambda time: float(np.mean([motion.skew(time) for motion in motions]))
     )
     if not protocol.phone:
@@ -122,11 +129,11 @@ def plan(
 
 
 def _mixed(motions: Sequence[SimulatedMotion], scale: float, rng: np.random.Generator) -> list[Fault]:
-    """What phones give: of any two neighbours one is sharp (blur under `SHARP_BLUR`) and one is not.
+    """Choose mixed faults: one frame of each pair is sharp (blur up to `SHARP_BLUR`), the other is degraded.
 
-    Of the others the 60 % that move fastest are blurred by 7-22 px; of the rest every other one is defocused
-    by a disc of 3-6 px and misexposed by 1.3-2.2 stops in turn. The exposure of all drifts slowly by up to
-    0.1 stops, as automatic exposure does.
+    The 60 % of the degraded frames that move fastest get a motion blur of 7-22 px. The rest is defocused by a
+    disc of 3-6 px or misexposed by 1.3-2.2 stops, in turn. The exposure of all frames drifts slowly by up to
+    0.1 stops, as with automatic exposure.
     """
     count = len(motions)
     pairs = np.arange(0, count - 1, 2)
@@ -146,7 +153,7 @@ def _mixed(motions: Sequence[SimulatedMotion], scale: float, rng: np.random.Gene
         elif number in degraded:
             stops += float(rng.choice([-1, 1]) * rng.uniform(1.3, 2.2))
             noise = 3 * NOISE
-        exposure = duration_for(blur * scale, motion.blur)
+        exposure = solve_duration(blur * scale, motion.blur)
         faults.append(Fault(exposure, 0.0, radius * scale, stops, noise))
     return faults
 
@@ -157,7 +164,14 @@ def noisy_poses(
     depth: float,
     seed: int,
 ) -> NDArray[np.float64]:  # [F, 3, 4]
-    """The poses that the user is given, ``depth`` being the mean depth of the capture in world units."""
+    """Return the given poses: ``poses`` with noise.
+
+    Args:
+        poses: Exact poses.
+        protocol: Levels of the noise.
+        depth: Mean depth of the capture, world units.
+        seed: Seed of the noise.
+    """
     rng = np.random.default_rng([seed, Stream.POSE_NOISE])
     turns = np.radians(protocol.rotation_noise) * rng.standard_normal((len(poses), 3))
     shifts = protocol.translation_noise * depth * rng.standard_normal((len(poses), 3))

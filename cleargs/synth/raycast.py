@@ -1,8 +1,8 @@
 """A small ray caster for the room, in Numba.
 
-It shares nothing with the splatting core, so that the truth it makes cannot share that core's errors. Every
-image is the mean of samples; a sample casts one jittered ray a pixel with its own camera pose a row and its
-own point on the lens. Anti-aliasing, motion blur, rolling shutter and defocus are therefore one mechanism.
+It shares no code with the splatting core, so that ground truth does not share that core's errors. Each image
+is the mean of samples. A sample casts one jittered ray per pixel, with one camera pose per row and one point
+on the lens. This gives anti-aliasing, motion blur, rolling shutter and defocus.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from cleargs.types import ArrayF64
 configure_numba("raycast")
 
 MISS = 1e30
+"""Distance of a ray that hits nothing."""
 AMBIENT = 0.42
 LAMP = 1.9
 PENUMBRA, CONTACT = 0.1, 0.015
-"""Half width of a shadow's soft rim: a share of the distance to what casts it, and metres."""
+"""Half width of the soft edge of a shadow: as a share of the distance to the object, plus metres."""
 OCCLUSION = 0.8
 
 
@@ -49,7 +50,7 @@ def _dot(a: ArrayF64, b: ArrayF64) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _hit_box(origin: ArrayF64, ray: ArrayF64, half: ArrayF64, normal: ArrayF64) -> float:
-    """Distance to a box of half sides ``half`` at the origin, from outside or from inside."""
+    """Return the distance to a box at the origin with half sides ``half``, from outside or inside."""
     near, far, near_axis, far_axis = -MISS, MISS, 0, 0
     for axis in range(3):
         speed = ray[axis] if abs(ray[axis]) > 1e-12 else 1e-12
@@ -86,7 +87,7 @@ def _hit_sphere(origin: ArrayF64, ray: ArrayF64, radius: float, normal: ArrayF64
 
 @njit(cache=True, error_model="numpy")
 def _hit_rod(origin: ArrayF64, ray: ArrayF64, radius: float, half_length: float, normal: ArrayF64) -> float:
-    """An open cylinder about the y axis."""
+    """Return the distance to an open cylinder about the y axis."""
     a = ray[0] * ray[0] + ray[2] * ray[2]
     b = origin[0] * ray[0] + origin[2] * ray[2]
     root = b * b - a * (origin[0] * origin[0] + origin[2] * origin[2] - radius * radius)
@@ -103,7 +104,7 @@ def _hit_rod(origin: ArrayF64, ray: ArrayF64, radius: float, half_length: float,
 
 @njit(cache=True, error_model="numpy")
 def _texture_coordinates(kind: int, point: ArrayF64, normal: ArrayF64, size: ArrayF64, uv: ArrayF64) -> None:
-    """Metres along the surface; each face of a box sees another part of its texture."""
+    """Write the position on the surface in metres to ``uv``. Each face of a box has another offset."""
     if kind == BOX:
         axis = 0
         for candidate in range(1, 3):
@@ -124,7 +125,7 @@ def _texture_coordinates(kind: int, point: ArrayF64, normal: ArrayF64, size: Arr
 
 @njit(cache=True, error_model="numpy")
 def _sample(texture: NDArray[np.float32], uv: ArrayF64, footprint: float, colour: ArrayF64) -> None:
-    """Trilinear lookup; ``footprint`` is the size of a pixel on the surface, in metres."""
+    """Look up a texture trilinearly; ``footprint`` is the size of a pixel on the surface, in metres."""
     level = min(max(math.log2(max(footprint * TEXELS_PER_METRE, 1e-6)), 0.0), LEVELS - 1.001)
     colour[0], colour[1], colour[2] = 0.0, 0.0, 0.0
     for step in range(2):
@@ -145,7 +146,7 @@ def _sample(texture: NDArray[np.float32], uv: ArrayF64, footprint: float, colour
 
 @njit(cache=True, error_model="numpy")
 def _to_local(item: np.void, vector: ArrayF64, shift: bool, local: ArrayF64) -> None:
-    """A direction, or with ``shift`` a point, in the primitive's own axes."""
+    """Transform a direction (or with ``shift`` a point) to the primitive's axes."""
     centre, rotation = item["centre"], item["rotation"]
     x = vector[0] - centre[0] if shift else vector[0]
     y = vector[1] - centre[1] if shift else vector[1]
@@ -156,7 +157,7 @@ def _to_local(item: np.void, vector: ArrayF64, shift: bool, local: ArrayF64) -> 
 
 @njit(cache=True, error_model="numpy")
 def _cover_of_sphere(to_centre: ArrayF64, radius: float, to_light: ArrayF64, reach: float) -> float:
-    """How much of the lamp a ball hides from a point, 0 to 1, soft at its rim."""
+    """Return the share of the lamp, 0 to 1, that a ball hides from a point, with a soft edge."""
     along = _dot(to_centre, to_light)
     if along <= 0.0 or along >= reach:
         return 0.0
@@ -167,10 +168,10 @@ def _cover_of_sphere(to_centre: ArrayF64, radius: float, to_light: ArrayF64, rea
 
 @njit(cache=True, error_model="numpy")
 def _cover_of_box(point: ArrayF64, ray: ArrayF64, half: ArrayF64, reach: float) -> float:
-    """How much of the lamp a box hides from ``point``, 0 to 1; both vectors in the box's axes.
+    """Return the share of the lamp, 0 to 1, that a box hides from ``point``; vectors are in the box's axes.
 
-    By the room that the box leaves on the side where the ray passes its middle: soft over the penumbra, or
-    over the box's own thickness where that is less.
+    The share depends on the distance between the box's nearest face and the middle of the ray in the box. The
+    soft edge is as wide as the penumbra, or as the box if that is thinner.
     """
     near, far = -MISS, MISS
     for axis in range(3):
@@ -198,7 +199,7 @@ def _light_at(
     own: int,
     scratch: ArrayF64,  # [3, 3]
 ) -> tuple[float, float]:
-    """Share of the lamp and share of the ambient light that the primitives leave (0 dark, 1 lit)."""
+    """Return the shares of the lamp and of the ambient light that reach ``point`` (0 dark, 1 lit)."""
     lit, ambient = 1.0, 1.0
     to_centre, local_point, local_ray = scratch[0], scratch[1], scratch[2]
     for number in range(1, primitives.shape[0]):
@@ -210,7 +211,7 @@ def _light_at(
             to_centre[axis] = centre[axis] - point[axis]
         away = _dot(to_centre, to_centre)
         rise = _dot(to_centre, normal)
-        if rise > 0.0:  # what a ball of that size hides of a clear sky
+        if rise > 0.0:  # ambient occlusion by a ball of the primitive's size
             ambient *= 1 - OCCLUSION * min(radius * radius / away, 1.0) * rise / math.sqrt(away)
         along = _dot(to_centre, to_light)
         margin = item["bound"] + PENUMBRA * max(along, 0.0) + CONTACT
@@ -237,7 +238,7 @@ def _trace(
     colour: ArrayF64,
     scratch: ArrayF64,  # [10, 3], so that a ray allocates nothing
 ) -> tuple[float, int]:
-    """Radiance along one ray into ``colour``; returns the distance and the number of what it hits."""
+    """Write the radiance along a ray to ``colour``. Return the distance and index of the hit primitive."""
     best, hit = MISS, 0
     normal, best_normal, local_point, local_ray = scratch[0], scratch[1], scratch[2], scratch[3]
     for number in range(primitives.shape[0]):
@@ -278,7 +279,7 @@ def _trace(
 
     lit, ambient = _light_at(point, world_normal, to_light, reach, primitives, hit, scratch[7:10])
     diffuse = max(_dot(world_normal, to_light), 0.0) * lit * LAMP / (1 + 0.25 * reach * reach)
-    # Ambient light also fades towards the room's edges.
+    # Ambient light also decreases near the walls.
     for axis in range(3):
         gap = primitives[0]["size"][axis] - abs(point[axis] - primitives[0]["centre"][axis])
         ambient *= 1 - 0.35 * math.exp(-max(gap, 0.0) / 0.25)
@@ -297,7 +298,7 @@ def _trace(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _render(
-    poses: ArrayF64,  # [S, H, 3, 4] camera to world, of each row in each sample
+    poses: ArrayF64,  # [S, H, 3, 4] camera to world, per sample and row
     jitter: ArrayF64,  # [S, 2] offset inside the pixel, in [0, 1)
     lens: ArrayF64,  # [S, 2] point on the lens, metres; zero for a pinhole
     focus: float,
@@ -308,11 +309,12 @@ def _render(
     primitives: NDArray[np.void],
     textures: NDArray[np.float32],
     light: ArrayF64,
-    track: ArrayF64,  # [S, H, 3] where the last primitive is; [0, 0, 3]: where it says itself
+    track: ArrayF64,  # [S, H, 3] centre of the last primitive; [0, 0, 3]: it does not move
     image: ArrayF64,
     depth: ArrayF64,
-    share: ArrayF64,  # of the samples that see the last primitive
+    share: ArrayF64,  # [H, W] share of the samples that see the last primitive
 ) -> None:
+    """Add the mean of the samples to ``image`` [H, W, 3], ``depth`` [H, W] (camera z) and ``share``."""
     passes, height, width = poses.shape[0], image.shape[0], image.shape[1]
     last = primitives.shape[0] - 1
     for row in prange(height):
@@ -343,32 +345,34 @@ def _render(
 
 @dataclass(frozen=True)
 class RoomWorld:
-    """The room as a `cleargs.synth.optics.World`; lengths in metres."""
+    """The room as a `cleargs.synth.optics.World`. Lengths are in metres."""
 
     room: Room
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
-        """The mean over the samples, each with one ray a pixel at its own place inside the pixel."""
+        """Return the mean of the samples [H, W, 3] in linear light. Each has its jitter inside the pixel."""
         return self._expose(shutter, lens, aperture)[0]
 
     def film(
         self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
     ) -> tuple[ArrayF64, ArrayF64]:
-        """The same with ``balloon`` in the room, where it is at each row's time in each sample; and the share
-        [H, W] of the exposure in which a pixel sees it.
+        """Render the room with a balloon that moves during the exposure.
+
+        Returns:
+            Linear light [H, W, 3], and per pixel [H, W] the share of the exposure that sees the balloon.
         """
         image, _, share = self._expose(shutter, lens, aperture, balloon)
         return image, share
 
     def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
-        """Exact depth through the pixel centres."""
+        """Return the exact camera z at the pixel centres [H, W]."""
         middle = Shutter(pose[None], np.zeros((1, lens.height), np.intp))
         return self._expose(middle, lens, PINHOLE)[1]
 
     def _expose(
         self, shutter: Shutter, lens: Lens, aperture: Aperture, balloon: Balloon | None = None
     ) -> tuple[ArrayF64, ArrayF64, ArrayF64]:
-        """Image, depth, and share of the samples that see the last primitive; see `_render`."""
+        """Return image, depth, and the share of the samples that see the last primitive; see `_render`."""
         primitives, track = self.room.primitives, np.empty((0, 0, 3))
         if balloon is not None:
             times = np.broadcast_to(shutter.times, len(shutter.poses))[shutter.index]
@@ -384,8 +388,8 @@ class RoomWorld:
         return image, depth, share
 
 
-def room_setting(frames: int, width: int, height: int, seed: int) -> SceneSetup:
-    """The procedural room of ``seed``, in metres, and a walk around its table."""
+def room_setup(frames: int, width: int, height: int, seed: int) -> SceneSetup:
+    """Return the procedural room of ``seed`` with a balloon, and a walk around its table."""
     room = make_room(seed)
     world, course, lens = RoomWorld(room), Orbit(room.focus, frames, seed), phone_lens(width, height)
     return SceneSetup("room", world, course, lens, partial(world.film, Balloon(room, seed)))

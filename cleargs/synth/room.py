@@ -1,7 +1,6 @@
-"""A procedural room: textured walls and floor, posters, boxes for furniture, spheres and thin rods; and a
-balloon that may drift through it.
+"""A procedural room with textured walls, posters, furniture, balls and thin rods, and a balloon to add.
 
-Its textures are seeded and periodic, with detail at every scale, so that SIFT finds the surfaces.
+Textures are seeded and periodic. They have detail at all scales, so that SIFT finds features on all surfaces.
 """
 
 from __future__ import annotations
@@ -21,12 +20,13 @@ SIZE = 512
 TEXELS_PER_METRE = 256.0
 LEVELS = 8
 LEVEL_STARTS = tuple(sum((SIZE >> finer) ** 2 for finer in range(level)) for level in range(LEVELS))
-"""Where each mip level begins in the chain of a texture."""
+"""Index of the first texel of each mip level in a texture."""
 SURFACES, PRINTS = 8, 6
+"""Number of material textures and of posters."""
 
 
 def _noise(rng: np.random.Generator, slope: float, stretch: float = 1.0) -> NDArray[np.float64]:
-    """Periodic 1/f^slope noise of zero mean and unit deviation; ``stretch`` > 1 draws it out along x."""
+    """Return periodic 1/f^slope noise of zero mean and unit variance, longer along x for ``stretch`` > 1."""
     frequency_y = np.fft.fftfreq(SIZE)[:, None]
     frequency_x = np.fft.rfftfreq(SIZE)[None, :] * stretch
     radius = np.hypot(frequency_x, frequency_y)
@@ -43,7 +43,7 @@ def _mix(
 
 
 def _surface(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Plaster, cloth or wood: two tones blended by noise, with fine grain and darker blotches."""
+    """Return a texture like plaster, cloth or wood: two tones mixed by noise, grain and dark blotches."""
     base = rng.uniform(0.25, 0.75, 3)
     stretch = rng.choice([1.0, 1.0, 8.0])
     tone = 1 / (1 + np.exp(-2.5 * _noise(rng, 1.1, stretch)))
@@ -54,7 +54,7 @@ def _surface(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _print(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A poster: rectangles, discs, strokes and letter-like marks on a tinted ground, wrapped at the edges."""
+    """Return a poster: rectangles, discs, lines and letters on a tinted ground, wrapped at the edges."""
     canvas = np.empty((SIZE, SIZE, 3), np.uint8)
     canvas[:] = rng.integers(128, 240, 3)
     for _ in range(140):
@@ -80,7 +80,7 @@ def _print(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def make_textures(rng: np.random.Generator) -> NDArray[np.float32]:  # [textures, texels of all levels, 3]
-    """`SURFACES` material textures followed by `PRINTS` posters, with box-filtered mip levels; linear RGB."""
+    """Return `SURFACES` materials, then `PRINTS` posters, with box-filtered mip levels, in linear RGB."""
     chains = []
     for image in [_surface(rng) for _ in range(SURFACES)] + [_print(rng) for _ in range(PRINTS)]:
         current, chain = np.clip(image, 0.01, 0.98), []
@@ -100,7 +100,7 @@ PRIMITIVE = np.dtype(
         ("texture", np.int64),
         ("gloss", np.float64),  # strength of the highlight, 0 for a matt surface
         ("bound", np.float64),  # radius of the bounding sphere
-        # Radius of a ball of its volume, that hides ambient light; 0: it casts no shadow.
+        # Radius of the ball that stands for it in ambient occlusion; 0: it casts no shadow.
         ("shade", np.float64),
     ]
 )
@@ -108,20 +108,21 @@ PRIMITIVE = np.dtype(
 
 @dataclass(frozen=True)
 class Room:
-    """A world the ray caster can draw: metres, y up, the floor at y = 0."""
+    """Room for the ray caster, in metres, with y up and the floor at y = 0."""
 
     primitives: NDArray[np.void]  # [P] of PRIMITIVE; the first is the room itself, seen from inside
     textures: NDArray[np.float32]  # [T, texels of all levels, 3] linear RGB
     light: NDArray[np.float64]  # [3] position of the lamp
-    focus: NDArray[np.float64]  # [3] what a visitor looks at
+    focus: NDArray[np.float64]  # [3] target of the camera
 
 
 SWAY = np.array([0.75, 0.08, 0.2])
-"""How far a balloon drifts to either side of where it is at rest, metres."""
+"""Amplitude of a balloon's motion per axis, metres."""
 
 WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5
+"""Size of the room, metres."""
 FLOOR = 0.004
-"""Half the thickness of the floor's covering."""
+"""Half the thickness of the floor covering, metres."""
 
 
 def _primitive(
@@ -143,7 +144,7 @@ def _primitive(
 
 
 def make_room(seed: int) -> Room:
-    """The room of ``seed``: the same layout idea, other furniture, textures and light."""
+    """Return the room of ``seed``. Rooms have similar layouts, but other furniture, textures and light."""
     rng = np.random.default_rng([seed, Stream.ROOM])
     textures = make_textures(rng)
 
@@ -181,7 +182,7 @@ def make_room(seed: int) -> Room:
         radius = rng.uniform(0.07, 0.12)
         centre = (table[0] + rng.uniform(-0.55, 0.55), 0.75 + radius, table[2] + rng.uniform(-0.25, 0.3))
         items.append(_primitive(SPHERE, centre, (radius, 0, 0), material(), gloss=0.8))
-    for side in (-1.0, 1.0):  # a cupboard and a shelf beside it
+    for side in (-1.0, 1.0):  # a cupboard and a shelf on either side of it
         half = (rng.uniform(0.25, 0.4), rng.uniform(0.45, 0.8), rng.uniform(0.2, 0.3))
         centre = (side * rng.uniform(1.5, 1.9), half[1], -DEPTH / 2 + half[2] + rng.uniform(0.02, 0.4))
         items.append(_primitive(BOX, centre, half, material(), yaw=rng.uniform(-0.3, 0.3)))
@@ -189,7 +190,7 @@ def make_room(seed: int) -> Room:
         half = tuple(rng.uniform(0.12, 0.25, 3))
         centre = (rng.uniform(-1.6, 1.6), half[1], rng.uniform(0.0, 0.6))
         items.append(_primitive(BOX, centre, half, material(), yaw=rng.uniform(0, np.pi)))
-    for _ in range(4):  # thin rods leaning about
+    for _ in range(4):  # thin rods, slightly tilted
         centre = (rng.uniform(-1.8, 1.8), rng.uniform(0.7, 0.9), rng.uniform(-1.8, -0.9))
         size = (rng.uniform(0.008, 0.02), rng.uniform(0.6, 0.8), 0.0)
         items.append(
@@ -201,8 +202,9 @@ def make_room(seed: int) -> Room:
 
 
 class Balloon:
-    """A ball that drifts to and fro above the table of ``room``: it touches nothing, and crosses the view
-    from side to side in two or three seconds.
+    """A ball that moves back and forth above the table of a room.
+
+    It touches nothing. It crosses the view from side to side in two or three seconds.
     """
 
     def __init__(self, room: Room, seed: int) -> None:
@@ -210,11 +212,11 @@ class Balloon:
         centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
         texture = SURFACES + int(rng.integers(PRINTS))
         self.item = _primitive(SPHERE, centre, (0.11, 0, 0), texture, gloss=0.5)
-        """At rest."""
-        self._rates = 2 * np.pi / rng.uniform(4, 6, 3)  # radians a second
+        """The primitive at its mean position."""
+        self._rates = 2 * np.pi / rng.uniform(4, 6, 3)  # radians per second
         self._phases = rng.uniform(0, 2 * np.pi, 3)
 
     def centres(self, times: NDArray[np.float64]) -> NDArray[np.float64]:  # [...] seconds
-        """Metres [..., 3]."""
+        """Return the positions [..., 3] in metres."""
         waves = np.sin(self._rates * times[..., None] + self._phases)
         return np.asarray(self.item["centre"] + SWAY * waves, np.float64)

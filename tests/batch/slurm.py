@@ -1,6 +1,7 @@
-"""A real Slurm of two nodes on loopback, its daemons children of the test, its files in one folder.
+"""A real Slurm with two nodes on the loopback interface.
 
-It has no accounting, no cgroups and no systemd. Each node has four CPUs.
+Its daemons are children of the test, and its files are in one folder. It has no accounting, no cgroups and no
+systemd. Each node has four CPUs.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SlurmctldHost={host}(127.0.0.1)
 SlurmUser={user}
 SlurmdUser={user}
 AuthType=auth/munge
-# Requeued jobs wait until their credentials are void: 5 seconds, the least there is, instead of two minutes.
+# Requeued jobs wait until their credentials expire: 5 seconds, which is the minimum, instead of two minutes.
 AuthInfo=socket={folder}/munge/socket,cred_expire=5
 CredType=cred/munge
 CommunicationParameters=NoCtldInAddrAny,NoInAddrAny
@@ -66,7 +67,7 @@ MUNGE_FILES = {
 
 
 def program(name: str) -> str | None:
-    """Return where ``name`` is installed."""
+    """Return the path of the program ``name``, or None if it is not installed."""
     return shutil.which(name) or shutil.which(name, path="/usr/sbin:/sbin")
 
 
@@ -85,7 +86,7 @@ class Slurm:
         return done.stdout
 
     def jobs(self) -> dict[str, str]:
-        """Return each job that Slurm remembers -> its state."""
+        """Return job -> state of all jobs that Slurm remembers."""
         lines = self("squeue", "--noheader", "--states", "all", "--Format", "JobID,State").splitlines()
         return dict(line.split() for line in lines)
 
@@ -94,14 +95,14 @@ class Slurm:
         return self("squeue", "--noheader", "--jobs", job, "--format", "%N").strip()
 
     def idle(self) -> bool:
-        """Return whether both nodes wait for work."""
+        """Return True if both nodes are idle."""
         try:
             return self("sinfo", "--noheader", "--Node", "--states", "idle").count("\n") == 2
         except AssertionError:  # the controller does not answer yet
             return False
 
     def clear(self) -> None:
-        """Cancel each job and take each node back, whatever a test left behind."""
+        """Cancel all jobs and resume all nodes that a test left in another state."""
         self("scancel", "--user", getpass.getuser())
         _until(lambda: not self("squeue", "--noheader"), self.folder)
         for node in ("n1", "n2"):
@@ -112,7 +113,7 @@ class Slurm:
 
 @contextmanager
 def running_slurm(folder: Path) -> Iterator[Slurm]:
-    """A cluster that lives as long as the block, its commands first on the PATH."""
+    """Yield a cluster that ends with the block. Its commands come first on the PATH."""
     for name in ("munge", "state", "bin", "log", "spool.n1", "spool.n2"):
         (folder / name).mkdir(parents=True)
     (folder / "munge").chmod(0o711)
@@ -125,21 +126,21 @@ def running_slurm(folder: Path) -> Iterator[Slurm]:
         CONFIGURATION.format(folder=folder, host=host, user=getpass.getuser(), ports=_free_ports(3))
     )
     for name in COMMANDS:
-        # Snakemake's plugin takes SLURM_* out of the environment, the place of slurm.conf included.
+        # Snakemake's plugin removes SLURM_* from the environment, and with it the path of slurm.conf.
         script = folder / "bin" / name
         script.write_text(f'#!/bin/sh\nSLURM_CONF={conf} exec {program(name)} "$@"\n')
         script.chmod(0o755)
     slurm = Slurm(folder)
     before = os.environ["PATH"]
-    with ExitStack() as held:
-        held.callback(os.environ.__setitem__, "PATH", before)
+    with ExitStack() as stack:
+        stack.callback(os.environ.__setitem__, "PATH", before)
         os.environ["PATH"] = f"{folder / 'bin'}:{before}"
 
         def start(name: str, *arguments: str) -> None:
             with (folder / "log" / f"{name}.log").open("ab") as log:
                 process = subprocess.Popen([str(program(name)), *arguments], stdout=log, stderr=log)
-            held.callback(process.wait)
-            held.callback(process.terminate)
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
 
         munge = [f"--{name}={folder}/munge/{file}" for name, file in MUNGE_FILES.items()]
         start("munged", "--foreground", "--force", *munge)
@@ -147,17 +148,17 @@ def running_slurm(folder: Path) -> Iterator[Slurm]:
         start("slurmctld", "-D", "-f", str(conf))
         for node in ("n1", "n2"):
             start("slurmd", "-D", "-N", node, "-f", str(conf))
-        held.callback(_kill_leftovers, folder)
+        stack.callback(_kill_leftovers, folder)
         _until(slurm.idle, folder)
         yield slurm
 
 
 def _kill_leftovers(folder: Path) -> None:
-    """Kill the processes that jobs of this cluster left behind: Slurm forgets those of a node set down."""
+    """Kill processes of jobs on this cluster. Slurm forgets the processes of a node that was set down."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            begun_here = "SLURM_JOB_ID=" in (environment := (process / "environ").read_text(errors="replace"))
-            if begun_here and str(folder / "bin") in environment:
+            is_job = "SLURM_JOB_ID=" in (environment := (process / "environ").read_text(errors="replace"))
+            if is_job and str(folder / "bin") in environment:
                 os.kill(int(process.name), signal.SIGKILL)
 
 
@@ -166,13 +167,13 @@ def _until(ready: Callable[[], object], folder: Path, seconds: float = 60.0) -> 
     while not ready():
         if time.monotonic() > deadline:
             logs = "\n".join(f"{log.name}: {log.read_text()[-1500:]}" for log in (folder / "log").iterdir())
-            raise AssertionError(f"Slurm did not come up\n{logs}")
+            raise AssertionError(f"Slurm did not start\n{logs}")
         time.sleep(0.1)
 
 
 def _free_ports(count: int) -> list[int]:
-    with ExitStack() as sockets:
-        taken = [sockets.enter_context(socket.socket()) for _ in range(count)]
+    with ExitStack() as stack:
+        taken = [stack.enter_context(socket.socket()) for _ in range(count)]
         for each in taken:
             each.bind(("127.0.0.1", 0))
         return [each.getsockname()[1] for each in taken]

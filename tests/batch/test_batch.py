@@ -47,7 +47,7 @@ barn,/barn,smoke,5,"""
 
 
 @pytest.mark.parametrize(("name", "text"), [("s.toml", TOML), ("s.csv", CSV + 'padded,"[1, 2]",\r\n')])
-def test_both_kinds_of_sheet_say_the_same(tmp_path: Path, name: str, text: str) -> None:
+def test_toml_and_csv_sheets_are_equivalent(tmp_path: Path, name: str, text: str) -> None:
     attic, barn = read(tmp_path, name, text)
     assert (attic.name, attic.source) == ("attic", tmp_path / "attic.mp4")
     assert (attic.recipe, attic.overrides) == (str(tmp_path / "mine.toml"), ("count.limit=5",))
@@ -62,8 +62,8 @@ def test_both_kinds_of_sheet_say_the_same(tmp_path: Path, name: str, text: str) 
 MISTAKES = {
     "s.csv": [
         ("name,input\na b,x\n,x\n", ["line 2: the name 'a b'", "line 3: the scene has no name"]),
-        ("name,input\na,x\na,y\nb,\n", ["line 3: the name 'a' is taken by s.csv, line 2", "line 4"]),
-        ('name,input\n"a,x\nb,y\n', ["line 3: this is no CSV"]),
+        ("name,input\na,x\na,y\nb,\n", ["line 3: s.csv, line 2 already has the name 'a'", "line 4"]),
+        ('name,input\n"a,x\nb,y\n', ["line 3: this is not valid CSV"]),
     ],
     "s.toml": [
         ('[[scene]]\nname="a"\nimput="x"', ["scene a: the scene has no input", "no field 'imput'"]),
@@ -86,13 +86,13 @@ def test_mistakes_are_named_with_their_place(
 
 
 @pytest.mark.parametrize("text", ["", "[[scene", "scene = 3"])
-def test_no_toml_sheet_is_one_plain_error(tmp_path: Path, text: str) -> None:
+def test_an_invalid_toml_sheet_is_one_error(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError):
         read(tmp_path, "s.toml", text)
 
 
 @pytest.mark.parametrize("text", ["name;input\na;x\n", "name,input,input\na,x,y\n", "\n"])
-def test_no_csv_sheet_is_one_plain_error(tmp_path: Path, text: str) -> None:
+def test_an_invalid_csv_sheet_is_one_error(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError):
         read(tmp_path, "s.csv", text)
 
@@ -100,7 +100,7 @@ def test_no_csv_sheet_is_one_plain_error(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("row", "said"),
     [
-        ("nowhere.mp4,,", "there is no"),
+        ("nowhere.mp4,,", "nowhere.mp4 does not exist"),
         ("hall.mp4,0,", "g0.steps = 0 cannot be used"),
         ("hall.mp4,,nonesuch", "there is no expert 'nonesuch'"),
         ("hall.mp4,,nafnet-gopro", "nafnet-gopro is not installed"),
@@ -128,11 +128,9 @@ def test_a_folder_of_another_input_is_refused(toys: ToyBatch, capsys: pytest.Cap
     assert toys.work_done() == []
 
 
-def test_a_bad_scene_stops_no_other_and_the_next_batch_does_what_is_missing(
-    toys: ToyBatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (toys.root / "barn" / "11.txt").write_text("no number")  # square cannot take it
-    (toys.root / "cellar" / "20.txt").write_text("")  # count leaves it out
+def test_a_bad_scene_does_not_stop_the_others(toys: ToyBatch, capsys: pytest.CaptureFixture[str]) -> None:
+    (toys.root / "barn" / "11.txt").write_text("no number")  # an error in square
+    (toys.root / "cellar" / "20.txt").write_text("")  # count skips it
     assert toys.run("--json") == 1
     streams = capsys.readouterr()
     results = {result["scene"]: result for result in json.loads(streams.out)}
@@ -145,35 +143,35 @@ def test_a_bad_scene_stops_no_other_and_the_next_batch_does_what_is_missing(
     assert {name: row["cause"] for name, row in toys.summary().items()} == {
         name: result["cause"] for name, result in results.items()
     }
-    assert "attic: square: starts" in streams.err
+    assert "attic: square: started" in streams.err
     assert "no number" in (toys.folder / "logs" / "barn.log").read_text()
     page = (toys.folder / "report" / "index.html").read_text()
-    assert page.index("barn") < page.index("cellar") < page.index("attic"), "what needs a look comes first"
+    assert page.index("barn") < page.index("cellar") < page.index("attic"), "failed scenes come first"
     assert toys.digests("attic") == toys.undisturbed("attic")
     toys.work_done()
 
     (toys.root / "barn" / "11.txt").write_text("11")
     assert toys.run() == 3
     stages = [line for line in toys.work_done() if line in toys.dag.names]
-    assert sorted(stages) == ["count", "count", "square", "total"], "barn, and cellar's count once more"
+    assert sorted(stages) == ["count", "count", "square", "total"], "barn, and count of cellar"
     assert toys.digests("barn") == toys.undisturbed("barn")
     assert toys.run("--allow-partial") == 3
     assert toys.summary()["cellar"]["state"] == "partial" and toys.digests("cellar")
 
 
-def test_a_changed_setting_touches_its_scene_and_later_stages_only(toys: ToyBatch) -> None:
+def test_a_changed_setting_affects_its_scene_only(toys: ToyBatch) -> None:
     toys.write_sheet({"attic": "", "barn": ""})
     assert toys.run() == 0
     toys.work_done()
     toys.write_sheet({"attic": "", "barn": "set.square.power = 3"})
     assert toys.run("--no-report") == 0
     assert [line for line in toys.work_done() if line in toys.dag.names] == ["square", "total"]
-    toys.write_sheet({"attic": "", "barn": ""})  # going back is a hit
+    toys.write_sheet({"attic": "", "barn": ""})  # the old results are still in the store
     assert toys.run() == 0
     assert toys.work_done() == []
 
 
-def test_a_dry_run_tells_the_cost_and_a_summary_what_is_there(
+def test_dry_run_shows_the_cost_and_summary_the_results(
     toys: ToyBatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     toys.write_sheet({"attic": "", "barn": ""})
@@ -194,7 +192,7 @@ def test_a_dry_run_tells_the_cost_and_a_summary_what_is_there(
     assert "attic: 0.00 h, 0.0 GB memory, 0.00 GB disk; done" in capsys.readouterr().out
 
 
-def test_a_killed_batch_goes_on_from_its_checkpoint(toys: ToyBatch) -> None:
+def test_a_killed_batch_resumes_from_its_checkpoint(toys: ToyBatch) -> None:
     sheet = toys.write_sheet({"attic": ""}, held=True)
     code = f"""
 import runpy, sys
@@ -213,19 +211,17 @@ runpy.run_path({toys.program[1]!r}, run_name="__main__")
     assert toys.digests("attic") == toys.undisturbed("attic")
 
 
-def test_a_child_that_is_killed_is_a_failure_that_says_so(
-    toys: ToyBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_signal_that_killed_a_child_is_reported(toys: ToyBatch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cleargs.batch.loop.program", lambda: ["/bin/sh", "-c", "kill -9 $$"])
     toys.write_sheet({"attic": ""})
     assert toys.run() == 1
     assert toys.summary()["attic"]["cause"] == "ended by signal 9"
 
 
-def test_child_starts_where_no_script_is_next_to_the_interpreter(
+def test_child_starts_without_a_script_next_to_python(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An installation may keep its scripts elsewhere, and a user's folder may hold a file ``json.py``."""
+    """The scripts may be in another folder, and the working folder may have a file ``json.py``."""
     python = tmp_path / "python"
     python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
     python.chmod(0o755)

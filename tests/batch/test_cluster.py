@@ -1,4 +1,4 @@
-"""The Snakefile and its profile: on this machine, and on a real Slurm with jobs stopped and nodes lost."""
+"""The Snakefile and its profile, on this machine and on a real Slurm with stopped jobs and lost nodes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ sleep = asyncio.sleep
 asyncio.sleep = lambda seconds: sleep(min(seconds, 0.5))
 sys.exit(main())
 """
-"""Snakemake, but it asks Slurm twice a second: its plugin waits ten seconds longer each time."""
+"""Snakemake that asks Slurm every half second. Its plugin would wait ten seconds longer after each time."""
 
 
 def start(toys: ToyBatch, *arguments: str) -> subprocess.Popen[str]:
@@ -45,20 +45,20 @@ def start(toys: ToyBatch, *arguments: str) -> subprocess.Popen[str]:
 
 
 def finish(toys: ToyBatch, engine: subprocess.Popen[str], code: int) -> None:
-    """Wait for the end of Snakemake, which is to have the exit code ``code``."""
+    """Wait for the end of Snakemake, and check its exit code."""
     assert engine.wait(timeout=300) == code, (toys.root / "snakemake.log").read_text()[-4000:]
 
 
-def test_all_of_them_are_installed() -> None:
+def test_all_workflow_files_are_installed() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     patterns = settings["package-data"]["cleargs.workflows"]
-    there = {file for file in WORKFLOWS.rglob("*") if file.is_file() and file.suffix not in (".py", ".pyc")}
-    assert there == {file for pattern in patterns for file in WORKFLOWS.glob(pattern)}
+    present = {file for file in WORKFLOWS.rglob("*") if file.is_file() and file.suffix not in (".py", ".pyc")}
+    assert present == {file for pattern in patterns for file in WORKFLOWS.glob(pattern)}
 
 
 @pytest.mark.slow
 @needs_snakemake
-def test_a_bad_scene_stops_no_other_and_what_is_done_is_not_done_again(toys: ToyBatch) -> None:
+def test_a_bad_scene_does_not_stop_the_others(toys: ToyBatch) -> None:
     (toys.root / "barn" / "11.txt").write_text("no number")
     here = ("--cores", "1", "--keep-going", "--rerun-triggers", "mtime")
     finish(toys, start(toys, *here), 1)
@@ -77,7 +77,8 @@ def test_a_bad_scene_stops_no_other_and_what_is_done_is_not_done_again(toys: Toy
 
     (toys.root / "sheet.toml").write_text('[[scene]]\nname = "attic"\ninput = "nowhere"')
     finish(toys, start(toys, *here), 1)
-    assert "scene attic: there is no" in (toys.root / "snakemake.log").read_text()
+    cause = f"scene attic: {toys.root / 'nowhere'} does not exist"
+    assert cause in (toys.root / "snakemake.log").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,7 @@ def cluster() -> Iterator[Slurm]:
 
 @pytest.fixture
 def slurm(cluster: Slurm) -> Iterator[Slurm]:
-    """The cluster, empty and whole again after each test."""
+    """The cluster, cleared after each test."""
     yield cluster
     cluster.clear()
 
@@ -97,7 +98,7 @@ def slurm(cluster: Slurm) -> Iterator[Slurm]:
 @pytest.mark.slow
 @needs_snakemake
 @pytest.mark.skipif(bool(LACKING), reason=f"Slurm is not installed: {', '.join(LACKING)}")
-def test_a_time_limit_and_the_loss_of_a_node_cost_no_finished_work(toys: ToyBatch, slurm: Slurm) -> None:
+def test_time_limit_and_lost_node_cost_no_finished_work(toys: ToyBatch, slurm: Slurm) -> None:
     toys.write_sheet({"attic": "", "cellar": ""}, held=True)
     before = set(slurm.jobs())
     engine = start(toys, "--profile", str(WORKFLOWS / "profiles" / "slurm"))
@@ -107,7 +108,7 @@ def test_a_time_limit_and_the_loss_of_a_node_cost_no_finished_work(toys: ToyBatc
     plan = json.loads((toys.folder / "plan.json").read_text())
     assert "MinMemoryNode=2000M" in asked and "NumCPUs=4" in asked
     assert plan["scenes"][0]["hours"] == pytest.approx(6.4 / 60, abs=0.001) and "TimeLimit=00:20:00" in asked
-    slurm("scancel", "--signal=TERM", warned)  # as --signal does before the limit
+    slurm("scancel", "--signal=TERM", warned)  # like --signal before the limit
     toys.wait_until(
         lambda: slurm.jobs()[warned] not in ("RUNNING", "COMPLETING"), "the end of the warned job"
     )
@@ -119,7 +120,7 @@ def test_a_time_limit_and_the_loss_of_a_node_cost_no_finished_work(toys: ToyBatc
         if "down" in slurm("sinfo", "--noheader", "--nodes", node, "--format", "%T"):
             slurm("scontrol", "update", f"NodeName={node}", "State=RESUME")
     finish(toys, engine, 0)
-    assert len(set(slurm.jobs()) - before) == 3, "the warned job was submitted again, the lost one was not"
+    assert len(set(slurm.jobs()) - before) == 3, "only the warned job was submitted again"
     lines = toys.lines()
     assert lines.count("square 0.txt") == lines.count("square 20.txt") == 1, "no checkpoint was used"
     for scene in ("attic", "cellar"):

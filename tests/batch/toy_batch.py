@@ -1,4 +1,4 @@
-"""A batch of toy scenes: the stages of ``tests/pipeline/toy.py``."""
+"""A batch of toy scenes with the stages of ``tests/pipeline/toy.py``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SCENES = ("attic", "barn", "cellar")
 
 @dataclass(frozen=True)
 class ToyBatch:
-    """A sheet of captures of six numbers, each scene with its own."""
+    """A sheet of captures with six different numbers per scene."""
 
     root: Path
 
@@ -37,11 +37,11 @@ class ToyBatch:
 
     @property
     def hold(self) -> Path:
-        """While it exists, `square` of a held sheet waits after its first number."""
+        """While this file exists, `square` of a held sheet waits after its first number."""
         return self.root / "hold"
 
     def write_sheet(self, scenes: dict[str, str] | None = None, *, held: bool = False) -> Path:
-        """Write the sheet of ``scenes``: name -> lines below its ``[[scene]]``; None: all."""
+        """Write a sheet of ``scenes``: name -> lines below its ``[[scene]]``. None means all scenes."""
         lines = ['recipe = "empty.toml"']
         if held:
             self.hold.touch()
@@ -53,7 +53,7 @@ class ToyBatch:
         return sheet
 
     def run(self, *options: str) -> int:
-        """Run `cleargs batch` to its end; return its exit code."""
+        """Run `cleargs batch` and return its exit code."""
         return invoke(["batch", str(self.root / "sheet.toml"), "--device", "cpu", *options], self.dag)
 
     def summary(self) -> dict[str, dict[str, str]]:
@@ -73,19 +73,19 @@ class ToyBatch:
         return lines
 
     def wait_until(self, true: Callable[[], Any], what: str, seconds: float = 240.0) -> None:
-        """Wait until ``true`` says so."""
+        """Wait until ``true`` returns a true value."""
         deadline = time.monotonic() + seconds
         while not true():
             assert time.monotonic() < deadline, f"never saw {what}"
             time.sleep(0.05)
 
     def digests(self, scene: str) -> dict[str, str]:
-        """Return stage -> digest of the results that the run folder shows."""
+        """Return stage -> digest of the results that the run folder links to."""
         folder = self.folder / "scenes" / scene
         return {stage: read_manifest(folder / stage).digest for stage in self.dag.names}
 
     def undisturbed(self, scene: str) -> dict[str, str]:
-        """Return stage -> digest of a run by itself, in a store of its own."""
+        """Return stage -> digest of an undisturbed run of the scene, in a separate store."""
         folder = self.root / "undisturbed" / scene
         recipe = str(self.root / "empty.toml")
         dag = toy_dag(self.root / "other")
@@ -94,5 +94,5 @@ class ToyBatch:
 
     @property
     def program(self) -> list[str]:
-        """The toys' ``cleargs``."""
+        """Command that runs ``cleargs`` with the toy stages."""
         return [sys.executable, str(Path(toy.__file__)), str(self.root / "journal")]

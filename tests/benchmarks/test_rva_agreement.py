@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from rva_scenes import uniform_cues
-from vlm_server import FRAMES, Answer, Asked, truth, two_stages, vlm_server
+from vlm_server import FRAMES, Answer, Request, truth, two_stages, vlm_server
 
 from benchmarks.commands import invoke
 from benchmarks.rva.agreement import EvaluatorCues, compare, spearman
@@ -104,9 +104,9 @@ def test_agree_does_not_change_the_run(shell: Shell, monkeypatch: pytest.MonkeyP
     with vlm_server() as log:
         monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
         code, out, _ = shell.agree("statistics,qwen3-vl", "--json")
-        assert code == 0 and len(log.asked) == FRAMES
+        assert code == 0 and len(log.requests) == FRAMES
         assert shell.agree("statistics,qwen3-vl", "--json")[:2] == (0, out)
-        assert len(log.asked) == FRAMES, "scored once"
+        assert len(log.requests) == FRAMES, "scored once"
     assert shell.files() == before
     document = json.loads(out)
     assert json.loads((shell.folder / "agree" / "agreement.json").read_text()) == document
@@ -123,8 +123,8 @@ def test_agree_does_not_change_the_run(shell: Shell, monkeypatch: pytest.MonkeyP
 def test_agree_prints_a_report_for_models(shell: Shell) -> None:
     """The two models rank the frames in opposite orders."""
 
-    def script(asked: Asked, before: int) -> Answer:
-        frame = asked.frame if asked.chat["model"] == "up" else FRAMES - 1 - asked.frame
+    def script(request: Request, before: int) -> Answer:
+        frame = request.frame if request.chat["model"] == "up" else FRAMES - 1 - request.frame
         return Answer(json.dumps(truth(frame)))
 
     with vlm_server(script) as log:
@@ -147,8 +147,8 @@ def test_agree_reuses_the_scores_of_the_run(shell: Shell, monkeypatch: pytest.Mo
 
 
 def test_agree_names_frames_without_score(shell: Shell) -> None:
-    def script(asked: Asked, before: int) -> Answer:
-        return Answer(json.dumps(truth(asked.frame)) if asked.frame != 2 else "no")
+    def script(request: Request, before: int) -> Answer:
+        return Answer(json.dumps(truth(request.frame)) if request.frame != 2 else "no")
 
     with vlm_server(script) as log:
         code, out, err = shell.agree("statistics,qwen3-vl", "--set", f"rva.qwen.base_url={log.url}")

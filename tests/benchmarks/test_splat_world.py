@@ -74,7 +74,7 @@ def test_capture_follows_the_cameras_of_the_run(run: Path, tmp_path: Path) -> No
     out = tmp_path / "out"
     summary = make_capture(
         out, "gsotm-mb-rs", frames=6, width=96, height=54, seed=0, reporter=SilentReporter(),
-        setting=scene_setup(run / "g0" / "scene.ply", None, 6, 96, 54),
+        setup=scene_setup(run / "g0" / "scene.ply", None, 6, 96, 54),
     )  # fmt: skip
     assert summary["world"] == "myrun"
     scale = 96 / 640

@@ -88,5 +88,5 @@ def test_what_is_no_regular_file_is_named_at_once(images: Path, tmp_path: Path, 
         os.mkfifo(place)
     else:
         place.symlink_to("/dev/zero")
-    with DigestMemo(tmp_path / "memo.sqlite") as memo, pytest.raises(InputError, match="no regular file"):
+    with DigestMemo(tmp_path / "memo.sqlite") as memo, pytest.raises(InputError, match="not a regular file"):
         digests(images, memo)

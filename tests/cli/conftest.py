@@ -1,4 +1,4 @@
-"""The toy run that the tests start from."""
+"""The toy run with which the tests start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: exit codes, two lines of error, results on stdout."""
+"""The command line for users: exit codes, errors of two lines, results on stdout."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.run import print_outcomes
 from cleargs.cli.show import describe_table, sampled_rows
+from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
 from cleargs.parquet import column
@@ -61,7 +62,7 @@ def shell(
 
 
 @pytest.mark.parametrize("group", [[], ["models"]])
-def test_a_group_alone_shows_what_it_offers(group: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_group_alone_shows_its_help(group: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert invoke(group) == 2
     said = capsys.readouterr().err
     assert "error:" not in said and "Commands:\n" in said
@@ -72,13 +73,13 @@ def test_run_twice(shell: Shell) -> None:
     assert code == 0
     assert out.startswith(f"results: {shell.bench.folder}/total\n") and "time: " in out
     assert f"next: cleargs show {shell.bench.folder}\n" in out
-    assert "expected about" in err and "square: starts (not made yet)" in err
+    assert "estimate: about" in err and "square: started (no results yet)" in err
     code, out, err = shell.run()
-    assert code == 0 and "already there: count, square, total\n" in out and err == ""
+    assert code == 0 and "reused: count, square, total\n" in out and err == ""
 
 
 def again(shell: Shell, *arguments: str) -> tuple[int, str, str]:
-    """``cleargs run`` on the same folder without any settings."""
+    """Call ``cleargs run`` on the same folder without settings."""
     return shell("run", str(shell.bench.capture), "-o", str(shell.bench.folder), *arguments)
 
 
@@ -97,34 +98,34 @@ def test_reset_and_workflow_start_from_the_recipe(shell: Shell) -> None:
     shell.run("--set", "square.power=3")
     shell.run("--set", "total.offset=1")
     total = shell.bench.folder / "total" / "total.txt"
-    assert total.read_text() == "plain 56.0 0", "an explicit recipe forgets the power"
+    assert total.read_text() == "plain 56.0 0", "an explicit recipe replaces the settings"
     code, _, err = again(shell, "--reset", "--workflow", shell.recipe)
     assert code == 0 and total.read_text() == "plain 55.0 0" and "--reset" not in err
 
 
-def test_run_says_what_it_will_redo_before_it_begins(shell: Shell) -> None:
-    assert "made again" not in shell.run()[2]
+def test_run_lists_the_stages_that_run_again(shell: Shell) -> None:
+    assert "runs again" not in shell.run()[2]
     _, _, err = again(shell, "--set", "square.power=3")
     lines = err.splitlines()
-    assert lines[0] == "square is made again: setting square.power: 2 -> 3"
-    assert lines[1] == "then total"
-    assert lines[2].startswith("expected about") and lines[3].startswith("square: starts")
+    assert lines[0] == "square runs again: setting square.power: 2 -> 3"
+    assert lines[1] == "then: total"
+    assert lines[2].startswith("estimate: about") and lines[3].startswith("square: started")
 
 
 def test_the_cost_is_revised_when_the_capture_is_known(shell: Shell) -> None:
     _, _, err = shell.run("--set", "count.limit=3")
-    first, revised = (line for line in err.splitlines() if "expected about" in line)
+    first, revised = (line for line in err.splitlines() if "estimate: about" in line)
     assert first == (
-        "expected about 6.4 min: count 6 s 0.1 GB, disk 1 MB; square 6.0 min 0.1 GB, disk 1 MB; "
-        "total 18 s 0.1 GB, disk 1 MB"
+        "estimate: about 6.4 min (count 6 s, 0.1 GB memory, 1 MB disk; "
+        "square 6.0 min, 0.1 GB memory, 1 MB disk; total 18 s, 0.1 GB memory, 1 MB disk)"
     )
-    assert revised.startswith("now expected about 3.3 min: square 3.0 min")
-    assert err.index(revised) > err.index("count: starts")
+    assert revised.startswith("new estimate: about 3.3 min (square 3.0 min")
+    assert err.index(revised) > err.index("count: started")
 
 
 def test_a_place_that_is_no_disk_is_named(shell: Shell) -> None:
     code, _, err = shell("run", str(shell.bench.capture), "-o", "/proc/x", "--workflow", shell.recipe)
-    assert code == 1 and "error: cannot write /proc/x" in err and "are free" not in err
+    assert code == 1 and "error: cannot write /proc/x" in err and "GB free" not in err
 
 
 def test_an_existing_run_keeps_its_store(shell: Shell, tmp_path: Path) -> None:
@@ -148,11 +149,11 @@ def test_settings_lists_what_the_models_say(shell: Shell) -> None:
         "name": "count.limit",
         "default": 100,
         "allowed": "a whole number, at least 1 and at most 1000",
-        "meaning": "at most so many numbers",
+        "meaning": "maximum count of numbers",
     }
     assert [setting["name"] for setting in found][-1] == "count.inner.depth"
     code, out, _ = shell("settings")
-    assert code == 0 and "at most so many numbers" in out and "power" in out and "offset" in out
+    assert code == 0 and "maximum count of numbers" in out and "power" in out and "offset" in out
     assert shell("settings", "cuont")[2].endswith("hint: did you mean count?\n")
 
 
@@ -168,8 +169,8 @@ def test_quiet_says_nothing_on_stderr(shell: Shell) -> None:
 
 def test_dry_run_writes_nothing(shell: Shell) -> None:
     code, out, _ = shell.run("--dry-run")
-    assert code == 0 and "count        missing  not made yet" in out and "waits for count" in out
-    assert "expected about" in out
+    assert code == 0 and "count        missing  no results yet" in out and "waits for count" in out
+    assert "estimate: about" in out
     assert not shell.bench.folder.exists()
 
 
@@ -228,7 +229,7 @@ def test_gc(shell: Shell) -> None:
     assert len(garbage) == 2 and all(Path(item["folder"]).exists() for item in garbage)
     shell("gc", folder)
     assert not any(Path(item["folder"]).exists() for item in garbage)
-    assert "already there: count, square, total" in shell.run()[1]
+    assert "reused: count, square, total" in shell.run()[1]
 
 
 def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -236,7 +237,7 @@ def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatc
     assert shell.run()[0] == 0
     assert (tmp_path / "shared" / "count").is_dir() and not shell.bench.store.exists()
     monkeypatch.delenv("CLEARGS_STORE")
-    assert shell("status", str(shell.bench.folder))[1].count("done") == 3, "run.toml knows its store"
+    assert shell("status", str(shell.bench.folder))[1].count("done") == 3, "run.toml names the store"
 
 
 @pytest.mark.parametrize(
@@ -244,14 +245,19 @@ def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatc
     [
         (["frob"], 2, "No such command 'frob'", "cleargs --help"),
         (["run"], 2, "Missing argument 'INPUT'", "cleargs run --help"),
-        (["run", "nowhere", "-o", "r"], 2, "there is no nowhere", "give a video"),
-        (["run", ".", "-o", "r", "--workflow", "fast"], 2, "there is no workflow 'fast'", "choose default"),
+        (["run", "nowhere", "-o", "r"], 2, "nowhere does not exist", "give a video"),
+        (
+            ["run", ".", "-o", "r", "--workflow", "fast"],
+            2,
+            "there is no recipe 'fast'",
+            "choose one of default",
+        ),
         (["run", ".", "-o", "r", "--threads", "0"], 2, "Invalid value for '--threads'", "cleargs run --help"),
-        (["status", "nowhere"], 2, "is no run", "cleargs run INPUT"),
-        (["show", "nowhere"], 2, "is no run", "cleargs run INPUT"),
-        (["show", "nowhere", "--rows", "3"], 2, "tables of a stage", "show nowhere rva --columns"),
-        (["gc"], 2, "neither a run nor a store", "--store"),
-        (["stage", "nope", "nowhere"], 2, "there is no stage 'nope'", "the stages are count, square, total"),
+        (["status", "nowhere"], 2, "is not a run", "cleargs run INPUT"),
+        (["show", "nowhere"], 2, "is not a run", "cleargs run INPUT"),
+        (["show", "nowhere", "--rows", "3"], 2, "name of a stage", "show nowhere rva --columns"),
+        (["gc"], 2, "no run and no store", "--store"),
+        (["stage", "nope", "nowhere"], 2, "there is no stage 'nope'", "choose one of count, square, total"),
     ],
 )
 def test_wrong_usage(shell: Shell, arguments: list[str], code: int, cause: str, hint: str) -> None:
@@ -262,12 +268,12 @@ def test_wrong_usage(shell: Shell, arguments: list[str], code: int, cause: str, 
     assert lines[1].startswith("hint: ") and hint in lines[1]
 
 
-def test_damaged_run_file_is_written_anew(shell: Shell) -> None:
+def test_damaged_run_file_is_replaced(shell: Shell) -> None:
     shell.run()
     (shell.bench.folder / "run.toml").write_text("[half")
     assert shell("status", str(shell.bench.folder))[0] == 2
     code, out, _ = shell.run()
-    assert code == 0 and "already there: count, square, total" in out
+    assert code == 0 and "reused: count, square, total" in out
     assert shell("status", str(shell.bench.folder))[0] == 0
 
 
@@ -276,7 +282,7 @@ def test_bad_setting_creates_nothing(shell: Shell) -> None:
     assert code == 2 and "at most 4" in err and not shell.bench.folder.exists()
 
 
-def test_unexpected_error_is_two_lines_and_debug_shows_the_traceback(shell: Shell) -> None:
+def test_unexpected_error_is_two_lines_without_debug(shell: Shell) -> None:
     (shell.bench.capture / "1.txt").write_text("one")
     code, _, err = shell.run("-q")
     assert code == 1 and "Traceback" not in err and len(err.splitlines()) == 2
@@ -331,11 +337,11 @@ def test_installed_stages_load_light() -> None:
 def test_tables_in_figures() -> None:
     schema = pa.schema(
         [
-            column("role", pa.string(), "what it does"),
+            column("role", pa.string(), "role"),
             column("weight", pa.float32(), "weight in [0, 1]", nullable=True),
             column("reliable", pa.bool_(), "trusted"),
             column("step", pa.int32(), "step"),
-            column("name", pa.string(), "its own in every row"),
+            column("name", pa.string(), "different in every row"),
         ]
     )
     rows = {
@@ -357,10 +363,10 @@ def test_tables_in_figures() -> None:
     assert describe_table(table.slice(0, 0))["weight"]["distinct"] == 0
 
 
-def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
-    """Python cannot raise KeyboardInterrupt in the call below, which would take hours."""
+def test_interrupt_ends_a_long_call_of_compiled_code() -> None:
+    """Python cannot raise KeyboardInterrupt during the call below, which would take hours."""
     program = (
-        "import hashlib; from cleargs.cli.terminal import answer_signals; answer_signals()\n"
+        "import hashlib; from cleargs.cli.terminal import handle_signals; handle_signals()\n"
         "print('ready', flush=True); hashlib.pbkdf2_hmac('sha256', b'x', b'y', 2**31 - 1)"
     )
     process = subprocess.Popen(
@@ -371,7 +377,7 @@ def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
     time.sleep(1)  # until it is in the call
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130 and "the same command resumes" in errors
+    assert process.returncode == 130 and "same command again to resume" in errors
     assert len(errors.splitlines()) == 1
 
 
@@ -379,7 +385,7 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     program = (
         "import os, signal, time; from cleargs.cli import terminal\n"
         "terminal.SAVING_S = 1.0\n"
-        "terminal.answer_signals()\n"
+        "terminal.handle_signals()\n"
         "child = os.fork()\n"
         "if child == 0: time.sleep(60); os._exit(0)\n"
         "time.sleep(0.2); os.kill(child, signal.SIGTERM); os.waitpid(child, 0)\n"
@@ -389,11 +395,11 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     assert done.returncode == 0 and done.stdout == "alive\n", done.stderr
 
 
-def test_a_signal_that_was_blocked_at_the_start_stays_blocked() -> None:
-    """A parent that blocks a signal for its child answers the signal itself."""
+def test_a_signal_blocked_at_the_start_stays_blocked() -> None:
+    """A parent process that blocks a signal for its child handles the signal itself."""
     program = (
-        "import os, signal; from cleargs.cli.terminal import answer_signals\n"
-        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}); answer_signals()\n"
+        "import os, signal; from cleargs.cli.terminal import handle_signals\n"
+        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}); handle_signals()\n"
         "os.kill(os.getpid(), signal.SIGTERM); print('alive')"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -445,8 +451,8 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
     assert capsys.readouterr().out.splitlines() == [
         f"scene: {run}/consolidate/scene.ply (22 of 24 frames placed, 7 strong, 11 repaired)",
         "quality: PSNR 23.6 dB (first scene 22.6) on pixels that no training saw; "
-        "views off the path are worse",
-        "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); already there: ingest, rva",
+        "views off the camera path are worse",
+        "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); reused: ingest, rva",
         f"look at: {run}/consolidate/before_after.png",
         f"next: cleargs export '{run}' -o 'my room.ply'",
     ]
@@ -461,7 +467,7 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
 def test_the_time_left_counts_from_the_first_step_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The first step waits for the kernels to be compiled, say: that is not the pace of the others."""
+    """The first step may wait for the compilation of kernels, so its time does not count."""
     clock = [0.0]
     monkeypatch.setattr("cleargs.progress.time.monotonic", lambda: clock[0])
     with make_reporter().task("G0", 1000) as task:
@@ -475,7 +481,7 @@ def test_the_time_left_counts_from_the_first_step_on(
 def test_the_time_left_follows_the_work_where_steps_differ(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Half of the steps may be a quarter of the work: a training's last steps have the most Gaussians."""
+    """Half of the steps may be a quarter of the work: the last steps have the most Gaussians."""
     clock = [0.0]
     monkeypatch.setattr("cleargs.progress.time.monotonic", lambda: clock[0])
     with make_reporter().task("G0", 1000) as task:
@@ -485,25 +491,69 @@ def test_the_time_left_follows_the_work_where_steps_differ(
     assert "G0: 500/1000, 30 s left" in capsys.readouterr().err.splitlines()
 
 
-def test_a_gpu_that_is_not_used_is_told_of(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+FACTS = {"gpu": "NVIDIA A1", "driver": "550.54.15"}
+PASSED = SelfTest(FACTS, [Check("Adam", [], 1.0)], gpu_ms=2.0, cpu_ms=60.0)
+FAILED = SelfTest(FACTS, [Check("Adam", ["means: differs by 1"], 1.0)])
+
+
+def test_auto_uses_a_tested_gpu_and_dry_run_tests_none(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = [None, PASSED]
     monkeypatch.setattr("cleargs.pipeline.session.cuda_obstacle", lambda: None)
-    assert "--device cuda" in shell.run()[2]
-    assert "--device cuda" not in shell.run("--device", "cpu")[2]
+    monkeypatch.setattr("cleargs.pipeline.session.current_facts", lambda: FACTS)
+    monkeypatch.setattr("cleargs.pipeline.session.cached_test", lambda facts: results[0])
+    monkeypatch.setattr("cleargs.pipeline.session.self_test", lambda facts, say: results.pop())
+    assert "device: the CPU, because the GPU is not tested yet" in shell.run("--dry-run")[2]
+    assert "device: the GPU, because NVIDIA A1 passed its self-test" in shell.run()[2]
+    assert 'device = "cuda"' in (shell.bench.folder / "run.toml").read_text()
+    assert "device: the" not in shell.run("--device", "cpu")[2]
 
 
-def test_the_doctor_notes_a_gpu_that_is_not_used(
+@pytest.mark.parametrize(
+    ("obstacle", "tested", "state", "words"),
+    [
+        ("there is no NVIDIA GPU", None, "ok", "cpu (there is no NVIDIA GPU)"),
+        (None, None, "note", "cpu (the GPU is not tested yet: cleargs doctor --gpu)"),
+        (None, PASSED, "ok", "cuda (NVIDIA A1 passed its self-test; a training step takes 2 ms"),
+        (None, FAILED, "note", "cpu (the GPU failed its self-test (Adam: means: differs by 1)"),
+    ],
+)
+def test_the_doctor_names_the_device(
+    obstacle: str | None,
+    tested: SelfTest | None,
+    state: str,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: obstacle)
+    monkeypatch.setattr("cleargs.gpu.current_facts", lambda: FACTS)
+    monkeypatch.setattr("cleargs.gpu.cached_test", lambda facts: tested)
+    invoke(["doctor", "--json"])
+    (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "device")
+    assert found["state"] == state and found["text"].startswith(words)
+
+
+def test_the_doctor_tests_the_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for obstacle, state, words in ((None, "note", "--device cuda"), ("no GPU", "ok", "cpu (no GPU)")):
-        monkeypatch.setattr("cleargs.cli.doctor.cuda_obstacle", lambda obstacle=obstacle: obstacle)
-        invoke(["doctor", "--json"])
-        (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "device")
-        assert found["state"] == state and words in found["text"]
+    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: "there is no NVIDIA GPU")
+    assert invoke(["doctor", "--gpu"]) == 1
+    assert "bad   device" in capsys.readouterr().out
+    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: None)
+    monkeypatch.setattr("cleargs.gpu.current_facts", lambda: FACTS)
+    for tested, last in (
+        (PASSED, ["Adam: passed, 1.0 s", "a training step takes 2 ms on the GPU, 60 ms on the CPU"]),
+        (FAILED, ["Adam: failed, 1.0 s", "  means: differs by 1"]),
+    ):
+        monkeypatch.setattr("cleargs.gpu.self_test", lambda facts, say, tested=tested: tested)
+        code, lines = invoke(["doctor", "--gpu"]), capsys.readouterr().out.splitlines()
+        assert lines[-2:] == last
+        assert "driver: 550.54.15" in lines
+        assert f"{'bad' if tested is FAILED else 'ok':<5} device" in "\n".join(lines)
+        assert code == (1 if tested is FAILED else 0)
 
 
-def test_the_doctor_tells_the_pace(
+def test_the_doctor_reports_the_pace(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for pace, words in ((None, "not measured yet"), (0.934, "takes 0.93 of the reference machine's time")):
@@ -513,7 +563,7 @@ def test_the_doctor_tells_the_pace(
         assert found == {"what": "pace", "state": "ok", "text": words}
 
 
-def test_elsewhere_than_on_linux_it_says_so() -> None:
+def test_other_systems_than_linux_are_refused() -> None:
     script = "import sys; sys.platform = 'darwin'; from cleargs.cli.entry import main; main()"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     cause, remedy = done.stderr.splitlines()
@@ -521,7 +571,7 @@ def test_elsewhere_than_on_linux_it_says_so() -> None:
 
 
 @pytest.mark.parametrize(("own", "policy"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
-def test_threads_wait_asleep_unless_told_otherwise(own: dict[str, str], policy: str) -> None:
+def test_threads_wait_passively_by_default(own: dict[str, str], policy: str) -> None:
     script = (
         "import os, sys\nfrom cleargs.cli.entry import main\nsys.argv = ['cleargs', '--version']\n"
         "try:\n    main()\nfinally:\n    print(os.environ['OMP_WAIT_POLICY'])"
@@ -533,7 +583,7 @@ def test_threads_wait_asleep_unless_told_otherwise(own: dict[str, str], policy: 
     assert done.stdout.splitlines()[-1] == policy
 
 
-def test_cores_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cores_are_counted_without_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("os.sched_getaffinity")
     monkeypatch.setattr("os.cpu_count", lambda: 6)
     assert usable_cores() == 6
@@ -541,23 +591,23 @@ def test_cores_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.
     assert usable_cores() == 1
 
 
-def test_a_run_is_no_capture(shell: Shell) -> None:
+def test_a_run_is_not_a_capture(shell: Shell) -> None:
     shell.run()
     code, _, err = shell("run", str(shell.bench.folder), "-o", str(shell.bench.root / "other"))
     assert code == 2 and "is a run, not a capture" in err and str(shell.bench.capture) in err
 
 
-def test_gc_takes_no_folder_for_a_store_that_is_none(shell: Shell, tmp_path: Path) -> None:
-    """The links of a run would be followed into its store, and any folder `work` be unfinished work."""
+def test_gc_refuses_a_folder_that_is_not_a_store(shell: Shell, tmp_path: Path) -> None:
+    """Otherwise `gc` would follow the links of a run, and treat any folder `work` as unfinished work."""
     shell.run()
     thesis = tmp_path / "papers" / "work" / "thesis.tex"
     thesis.parent.mkdir(parents=True)
     thesis.write_text("years")
     for folder in (shell.bench.folder, tmp_path / "papers"):
         code, _, errors = shell("gc", "--store", str(folder), "--checkpoints")
-        assert code == 2 and "is no store" in errors
+        assert code == 2 and "is not a store" in errors
     assert thesis.is_file()
-    assert "already there: count, square, total" in shell.run()[1]
+    assert "reused: count, square, total" in shell.run()[1]
 
 
 def test_stretch_of_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

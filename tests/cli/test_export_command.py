@@ -1,4 +1,4 @@
-"""``cleargs export``: what it refuses, and what it writes."""
+"""``cleargs export``: errors and files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import eval_world
 from colmap_model import write_sparse
 from eval_world import cameras, make_scene, write_run
 
-from cleargs.cli.export_pruning import cropped
+from cleargs.cli.export_pruning import crop_scene
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
 from cleargs.splat.ply import read_ply
@@ -34,13 +34,11 @@ def export(run: Path, output: Path, *more: str) -> int:
     return invoke(["export", str(run), "-o", str(output), *more])
 
 
-def test_the_ending_says_what_is_written(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_ending_chooses_the_format(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("x.splat", "x", "x.ply.gz"):
         assert export(run, tmp_path / name) == 2 and not (tmp_path / name).exists()
         cause, remedy = capsys.readouterr().err.splitlines()
-        assert "no ending that says what to write" in cause and ".ply" in remedy
+        assert "not a known scene format" in cause and ".ply" in remedy
     assert export(run, tmp_path / "x.PLY") == 0
     assert read_ply(tmp_path / "x.PLY").gaussians.num == 20
 
@@ -63,13 +61,13 @@ def test_a_stage_without_a_scene_is_named(
     assert "rva has no scene" in cause and "g0" in remedy
 
 
-def test_nothing_left_to_crop_is_said() -> None:
-    """After `--prune opacity:1`, say."""
+def test_nothing_left_to_crop_is_an_error() -> None:
+    """This happens for example after ``--prune opacity:1``."""
     scene = make_scene(count=5)
     empty = replace(scene, gaussians=scene.gaussians.select(torch.zeros(5, dtype=torch.bool)))
     for region in ((98.0,), (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)):
         with pytest.raises(InputError, match="no Gaussian is left"):
-            cropped(empty, region)
+            crop_scene(empty, region)
 
 
 def test_map_coordinates_keep_their_precision(

@@ -1,4 +1,4 @@
-"""What became of every frame, in words."""
+"""``cleargs show``: role, reason and repair of every frame."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def row(role: str, R: float | None, B: float | None, G: float | None = 0.1, **mo
 )
 def test_the_reason_names_the_threshold_that_decided(frame: dict[str, Any], words: str) -> None:
     assert reason(frame, SETTINGS) == words
-    assert len(words) <= 22, "the table is read at 100 columns"
+    assert len(words) <= 22, "the table must fit in 100 columns"
 
 
 def test_ablations_give_their_own_reasons() -> None:
@@ -50,10 +50,10 @@ def test_ablations_give_their_own_reasons() -> None:
 def test_the_worst_cue_of_both_kinds() -> None:
     assert worst_cue(row("strong", 1, 0, b_motion_blur=0.6, r_sharpness=0.5)) == "motion blur 0.60"
     assert worst_cue(row("strong", 1, 0, b_motion_blur=0.6, r_sharpness=0.3)) == "sharpness 0.30"
-    assert worst_cue(row("strong", 1, 0, b_motion_blur=0.1)) == "", "nothing to tell of"
+    assert worst_cue(row("strong", 1, 0, b_motion_blur=0.1)) == "", "no fault"
 
 
-def test_repairs_stand_beside_their_frames() -> None:
+def test_the_repair_of_a_frame_is_that_of_its_last_round() -> None:
     def chosen(number: int, layer: str, why: str = "primary score", accepted: bool = True) -> dict[str, Any]:
         return {"frame_id": 3, "round": number, "chosen": layer, "reason": why, "accepted": accepted}
 
@@ -78,7 +78,7 @@ def test_names_keep_their_end() -> None:
     assert short_name("a long walk in the garden_000012") == "…garden_000012"
 
 
-def test_figures_have_words() -> None:
+def test_figures_have_labels() -> None:
     summary = {
         "held_back": {"frames": [1, 2], "psnr_before": 22.5, "harm": None},
         "holdout_hash": "ab" * 32,
@@ -88,9 +88,9 @@ def test_figures_have_words() -> None:
         "some_new_figure": 3,
     }
     assert list(labelled(summary)) == [
-        ("held back: frames", "1, 2"),
-        ("held back: PSNR in the first scene, dB", "22.5"),
-        ("held back: harm", "none"),
+        ("judges: frames", "1, 2"),
+        ("judges: PSNR in the first scene, dB", "22.5"),
+        ("judges: harm", "none"),
         ("repairs by round", "11 in round 2"),
         ("round 1: chosen", "3 render, 9 restored, 2 as filmed"),
         ("weights", "5 from 0.1, 7 from 0.9"),

@@ -1,4 +1,4 @@
-"""What is printed: names from files cannot steer the terminal, and no error is unexpected."""
+"""Names from files cannot steer the terminal, and no error of the system is unexpected."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ REVERSED = "gpj.\u202eexe"
 def test_harmful_characters_are_shown(name: str) -> None:
     shown = printable(name)
     assert "\n" not in shown and shown.isprintable() and shown.encode()
-    assert json.loads(f'"{shown}"') == name, "the form is JSON's"
+    assert json.loads(f'"{shown}"') == name, "the escapes are those of JSON"
 
 
 @pytest.mark.parametrize("name", ["Zimmer 3/größe.png", "写真.jpg", "e\u0301 🙂", "مرحبا"])
@@ -128,10 +128,10 @@ def test_a_name_that_is_not_utf8(bench: Bench, capsys: pytest.CaptureFixture[str
         ["synth", "{}"],
     ],
 )
-def test_no_argument_is_taken_that_is_not_utf8(
+def test_arguments_that_are_not_utf8_are_refused(
     arguments: list[str], bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """They ended as "unexpected" errors, one of them after all the work."""
+    """Once they caused "unexpected" errors, one of them after all the work."""
     given = [argument.format(os.fsdecode(b"caf\xe9")) for argument in arguments]
     assert invoke(given, bench.dag) == 2
     told = capsys.readouterr().err
@@ -139,7 +139,7 @@ def test_no_argument_is_taken_that_is_not_utf8(
 
 
 def test_an_early_interrupt_is_silent() -> None:
-    """It comes while the console script imports the commands."""
+    """The signal arrives while the program imports the commands."""
     program = (
         "import os, signal, sys, time, types\n"
         "class Slow(types.ModuleType):\n"
@@ -152,8 +152,8 @@ def test_an_early_interrupt_is_silent() -> None:
     assert done.returncode == -2 and done.stderr == ""
 
 
-def test_an_interrupt_while_signals_are_set_up_is_answered() -> None:
-    """It fell into the start of the thread that waits for signals, and ended as a traceback."""
+def test_an_interrupt_during_the_setup_of_signals() -> None:
+    """Once, a signal during the start of the waiting thread caused a traceback."""
     program = (
         "import os, signal, threading\n"
         "start = threading.Thread.start\n"
@@ -169,7 +169,7 @@ def test_an_interrupt_while_signals_are_set_up_is_answered() -> None:
 
 
 def test_the_installed_script_escapes(bench: Bench) -> None:
-    """Through a real process, as a shell starts it; on a pipe the rule is the same as on a terminal."""
+    """Names are escaped on a pipe too, in a real process."""
     program = "import sys; from cleargs.cli.main import main; main(sys.argv[1:])"
     done = subprocess.run(
         [sys.executable, "-c", program, "show", str(bench.root / f"no{CLEAR}\nerror: run")],

@@ -1,4 +1,4 @@
-"""``cleargs verify``: what no time stamp tells."""
+"""``cleargs verify`` finds damage that no time stamp shows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def bench(tmp_path: Path) -> Bench:
 
 
 def rot(bench: Bench, file: Path) -> None:
-    """A byte changes with no trace in any time stamp: the memo still knows the old one."""
+    """Change one byte without a trace in any time stamp: the memo keeps the old digest."""
     known = file_digest(file)
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
@@ -32,23 +32,23 @@ def rot(bench: Bench, file: Path) -> None:
 
 def test_a_healthy_run(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     assert invoke(["verify", str(bench.folder)], bench.dag) == 0
-    assert "15 files of 3 stages read: all as they were made" in capsys.readouterr().out
+    assert "15 files of 3 stages read: all unchanged" in capsys.readouterr().out
 
 
-def test_what_rotted_is_named_and_made_again(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_is_named_and_repaired(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     healthy = bench.digests()
     rot(bench, (bench.folder / "count" / "numbers" / "3.txt").resolve())
-    assert bench.run()[0].how == "found", "no time stamp tells"
+    assert bench.run()[0].how == "found", "time stamps show nothing"
     assert invoke(["verify", str(bench.folder)], bench.dag) == 1
     told = capsys.readouterr()
     assert "damaged  count        numbers/3.txt has other content" in told.out
-    assert "15 files of 3 stages read: 1 fault" in told.out and "makes damaged results again" in told.err
+    assert "15 files of 3 stages read: 1 fault" in told.out and "replace damaged results with" in told.err
     assert bench.run()[0].how == "made"
     assert bench.digests() == healthy
     assert invoke(["verify", str(bench.folder)], bench.dag) == 0
 
 
-def test_inputs_that_changed_or_went(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_changed_and_missing_inputs(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     rot(bench, bench.capture / "3.txt")
     (bench.capture / "4.txt").unlink()
     (bench.capture / "9.txt").write_text("9")
@@ -68,11 +68,11 @@ def test_a_result_that_left_the_store(bench: Bench, capsys: pytest.CaptureFixtur
     assert "total        it is no longer in the store" in capsys.readouterr().out
 
 
-def test_a_copy_with_links_followed_is_read_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_copy_without_links_can_be_checked(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     copy = bench.root / "copy"
     shutil.copytree(bench.folder, copy)
     assert invoke(["verify", str(copy)], bench.dag) == 0
-    assert "15 files of 3 stages read: all as they were made" in capsys.readouterr().out
+    assert "15 files of 3 stages read: all unchanged" in capsys.readouterr().out
     (copy / "count" / "numbers" / "3.txt").write_text("rotten")
     assert invoke(["verify", str(copy)], bench.dag) == 1
 

@@ -174,7 +174,7 @@ def test_a_checkpoint_of_another_formation_is_not_taken(tmp_path: Path) -> None:
     first = Trainer(scene(), views(), CONFIG, seed=(3,), formation=CaptureFormation(views(), LOOK))
     other = FormationConfig(start=0.0, every=5)
     second = Trainer(scene(), views(), CONFIG, seed=(3,), formation=CaptureFormation(views(), other))
-    assert not second.wrote(first.state())
+    assert not second.matches(first.state())
 
 
 SKEW = FrameMotion(skew=np.array([0, 0, 0, 0, 9.0, 0]), median_depth=3.0)

@@ -15,9 +15,9 @@ from helpers.observations import (
     MEDIAN,
     WIDTH,
     Image,
+    frame_pair,
     observe,
     picture,
-    sight,
     soft,
     twist,
     wall,
@@ -75,7 +75,7 @@ def test_the_flow_of_a_reduced_view_is_reduced() -> None:
 )
 def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model) -> None:
     """By what it does to the image: turns and steps to the side are alike where the depth hardly varies."""
-    found = preferred(search(sight(soft(truth), observe(truth, motion))))
+    found = preferred(search(frame_pair(soft(truth), observe(truth, motion))))
     assert found.model == model
     assert found.explained > 0.3
     ours, theirs = (wall_fields(m) for m in (found.motion, motion))
@@ -87,14 +87,14 @@ def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model)
 
 
 def test_a_sharp_frame_is_left_alone(truth: Image) -> None:
-    found = preferred(search(sight(soft(truth), observe(truth, FrameMotion()))))
+    found = preferred(search(frame_pair(soft(truth), observe(truth, FrameMotion()))))
     # A soft render beside a sharp frame: nothing that a camera does makes the render sharper.
     assert found.explained < 0.01
 
 
 def test_a_fit_goes_on_from_the_last_one(truth: Image) -> None:
     nearly = replace(BLUR, blur=0.8 * BLUR.blur)
-    still, found = refine(sight(soft(truth), observe(truth, BLUR)), "blur", nearly)
+    still, found = refine(frame_pair(soft(truth), observe(truth, BLUR)), "blur", nearly)
     assert still.model == "none"
     before = np.linalg.norm(nearly.blur - BLUR.blur)
     assert np.linalg.norm(found.motion.blur - BLUR.blur) < 0.5 * before
@@ -103,7 +103,7 @@ def test_a_fit_goes_on_from_the_last_one(truth: Image) -> None:
 def test_a_pose_is_corrected_with_the_motion(truth: Image) -> None:
     shifted = replace(BLUR, pose=twist(0, 0, 0, 1.0, -2.0, 0))
     observed = observe(truth, shifted)
-    found = preferred(search(sight(soft(truth), observed), pose=True))
+    found = preferred(search(frame_pair(soft(truth), observed), pose=True))
     ours, theirs = (wall_fields(m) for m in (found.motion, shifted))
     assert torch.hypot(*theirs.offset).mean() > 2.0
     assert torch.hypot(*(ours.offset - theirs.offset)).mean() < 0.3
@@ -114,7 +114,7 @@ def test_masked_pixels_say_nothing(truth: Image) -> None:
     weight[40:90, 60:120] = 0.0
     observed = observe(truth, BLUR)
     ruined = np.where(weight[..., None] > 0, observed, np.float32(1.0))
-    clean, spoilt = (preferred(search(sight(soft(truth), o, weight))) for o in (observed, ruined))
+    clean, spoilt = (preferred(search(frame_pair(soft(truth), o, weight))) for o in (observed, ruined))
     np.testing.assert_array_equal(clean.motion.vector, spoilt.motion.vector)
 
 
@@ -123,7 +123,7 @@ def test_any_size(size: tuple[int, int]) -> None:
     image = np.random.default_rng(0).random((*size, 3)).astype(np.float32)
     ones = np.ones(size, np.float32)
     camera = replace(CAMERA, width=size[1], height=size[0])
-    frame = sight(picture(), picture())
+    frame = frame_pair(picture(), picture())
     seen = replace(
         frame,
         luminance=image[..., 0],
@@ -138,16 +138,16 @@ def test_any_size(size: tuple[int, int]) -> None:
 
 def test_nothing_to_see_finds_nothing() -> None:
     flat = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
-    assert preferred(search(sight(flat, flat))).explained <= 0.0
+    assert preferred(search(frame_pair(flat, flat))).explained <= 0.0
     nothing = np.zeros((HEIGHT, WIDTH), np.float32)
-    assert preferred(search(sight(flat, flat, nothing))).explained <= 0.0
+    assert preferred(search(frame_pair(flat, flat, nothing))).explained <= 0.0
 
 
 def test_threads_do_not_change_a_bit(truth: Image) -> None:
     found = []
     for threads in (1, 2):
         set_threads(threads)
-        found.append(preferred(search(sight(soft(truth), observe(truth, BOTH)))))
+        found.append(preferred(search(frame_pair(soft(truth), observe(truth, BOTH)))))
     np.testing.assert_array_equal(found[0].motion.vector, found[1].motion.vector)
     assert found[0].misfit == found[1].misfit
 
@@ -193,7 +193,7 @@ def test_search_runs_the_kernels_that_it_is_given(truth: Image) -> None:
             Counting.calls += 1
             return getattr(cpu, name)
 
-    seen = sight(observe(truth, BLUR), truth)
+    seen = frame_pair(observe(truth, BLUR), truth)
     given: Any = Counting()
     first = refine(seen, "blur", BLUR, kernels=given)
     assert Counting.calls > 2

@@ -1,10 +1,8 @@
-"""Compile every GPU kernel ahead of time, without a GPU, and print registers, stack and shared memory of
-each.
+"""Compile every GPU kernel without a GPU, and print its registers, stack and shared memory.
 
     python tests/gpu/compile_kernels.py [COMPUTE_CAPABILITY]     (default 90, a Hopper GPU)
 
-The signatures are those of the launches in ``cleargs.splat.kernels.cuda``. Needs Triton, whose wheel brings
-ptxas.
+The signatures are those of the launches in ``cleargs.splat.kernels.cuda``. Triton's wheel contains ptxas.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ UNFUSED = {"enable_fp_fusion": False}
 
 
 def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
-    """(kernel, types of its run-time arguments, compile-time arguments, options of the launch)."""
+    """Return (kernel, types of its run-time arguments, compile-time arguments, options of the launch)."""
     found: list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]] = [
         (
             binning.list_pairs,
@@ -221,7 +219,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
 def compiled(
     kernel: Any, types: dict[str, str], constants: dict[str, Any], options: dict[str, Any], capability: int
 ) -> Any:
-    """The compiled kernel; torch's memory is aligned to 16 bytes, as the launcher finds out by itself."""
+    """Return the compiled kernel. torch's memory is aligned to 16 bytes, which the launcher detects."""
     names = [parameter.name for parameter in kernel.params]
     assert set(names) == {*types, *constants}, kernel.__name__
     source = ASTSource(
@@ -238,7 +236,7 @@ def compiled(
 
 
 def resources(cubin: bytes) -> tuple[int, int]:
-    """Registers a thread, and stack bytes a thread (registers that were spilled)."""
+    """Return registers and stack bytes (spilled registers) per thread."""
     tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(cubin)

@@ -1,4 +1,4 @@
-"""The tests of what only a GPU's back end has."""
+"""Tests of the GPU's back end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from helpers import devices
 
 @pytest.fixture(autouse=True)
 def device(monkeypatch: pytest.MonkeyPatch) -> torch.device:
-    """The device of the test's tensors; every dispatch leads to the GPU's kernels."""
+    """Return the device of the test's tensors. Every dispatch chooses the GPU's kernels."""
     return devices.gpu(monkeypatch)
 
 

@@ -3,23 +3,24 @@
 #
 #     tests/gpu/run.sh OUT [RUN]
 #
-# Leaves in OUT: versions.txt; tests.log and agreement.log (the GPU tests against the oracle, and against the CPU back
-# end); sanitizer.log; bench/ (`python -m benchmarks splat --device cuda`); and, where RUN is given, g0/ (the first scene at
-# full size: its time and PSNR in stages.json). RUN is a folder with the finished ingest/ and rva/ of a capture, made
-# elsewhere: see splat_stages.py. A step that fails is named at the end and does not keep the others from running.
+# Writes into OUT: versions.txt; selftest.log (the self-test that users run); tests.log and agreement.log (the GPU tests
+# against the oracle, and against the CPU's kernels); sanitizer.log; bench/ (`python -m benchmarks splat --device cuda`);
+# and, if RUN is given, g0/ (the first scene at full size: its time and PSNR are in stages.json). RUN is a folder with the
+# finished ingest/ and rva/ of a capture, made on another machine: see splat_stages.py and pack_run.py. A step that fails is
+# named at the end; the others run.
 #
-# STEPS chooses among "tests agreement sanitizer bench g0" (all), for machines that are lent for minutes: each step ends
-# within ten. QUICK=1 makes the bench and the training small, to try the script. PYTHON names the interpreter (python3).
-# Triton compiles during the first of them, which takes a minute longer.
+# STEPS chooses among "selftest tests agreement sanitizer bench g0" (default: all), for machines that are rented by the minute:
+# each step ends within ten. QUICK=1 makes the bench and the training small, to try the script. PYTHON names the interpreter
+# (python3). Triton compiles during the first step, which takes a minute longer.
 #
 # Needs PyTorch with CUDA, Triton, pytest, hypothesis, numba, pydantic, pyarrow, scipy, OpenCV, safetensors, click, rich
-# and tomli-w; neither pycolmap nor OpenImageIO. gsplat is timed beside where it imports: its kernels are built for this
-# machine's architecture alone, while the tests run.
+# and tomli-w; neither pycolmap nor OpenImageIO. The self-test needs PyTorch, Triton, numba and SciPy only. gsplat is timed in turn
+# with our kernels if it can be imported: it is built for this machine's architecture only, while the tests run.
 set -uo pipefail
 cd "$(dirname "$0")/../.."
 out="$(mkdir -p "${1:?usage: tests/gpu/run.sh OUT [RUN]}" && cd "$1" && pwd)"
 run="${2:-}"
-steps=" ${STEPS:-tests agreement sanitizer bench g0} "
+steps=" ${STEPS:-selftest tests agreement sanitizer bench g0} "
 python="${PYTHON:-python3}"
 unset TRITON_INTERPRET
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
@@ -55,6 +56,7 @@ if wanted bench; then
   gsplat_build=$!
 fi
 
+step selftest 400 "$python" -m cleargs.gpu
 step tests 400 "$python" -m pytest -m gpu tests/gpu tests/splat tests/formation --deselect tests/gpu/test_gpu_against_cpu.py
 step agreement 300 "$python" -m pytest tests/gpu/test_gpu_against_cpu.py
 # Under memcheck: forward and backward pass, several chunks a tile, pixels that stop; the frame warp beyond borders.

@@ -4,15 +4,14 @@
 
 RUN holds the finished folders ``ingest`` and ``rva``, made by ``cleargs run CAPTURE -o RUN --until rva`` on
 any machine, with ``--set ingest.holdout=every:8`` for held-out frames, and ``--set ingest.max_size=...``
-where images are larger than 960 px. OUT gets the scene, its log and ``stages.json``: time, PSNR of the frames
-trained on and of those held out, and memory. What a time limit cuts off resumes from its checkpoint when the
-same command is given again.
+where images are larger than 960 px. It may be packed, see ``pack_run.py``. OUT gets the scene, its log and
+``stages.json``: time, PSNR of training and held-out frames, and memory. After a time limit, the same command
+resumes from the checkpoint.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import sys
 import time
@@ -21,6 +20,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
+from pack_run import unpack
 
 from cleargs.capture.tables import load_frames
 from cleargs.formation.exposure import read_exposure
@@ -29,11 +29,14 @@ from cleargs.formation.observed import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.splat.ply import read_ply
-from cleargs.stages.g0 import G0Config
+
+# `stages` is the package `cleargs.stages` as it is in the repository: nothing needs to be installed.
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from stages import g0
 
 
 class Lines(SilentReporter):
-    """Remarks and warnings as lines."""
+    """Print remarks and warnings."""
 
     def info(self, text: str) -> None:
         print(text, flush=True)
@@ -41,17 +44,15 @@ class Lines(SilentReporter):
     warn = info
 
 
-def train(run: Path, out: Path, config: G0Config, device: Any) -> dict[str, Any]:
-    """The stage, timed; its summary and what else is asked of it."""
+def train(run: Path, out: Path, config: g0.G0Config, device: Any) -> dict[str, Any]:
+    """Run the stage and return its summary, duration and memory."""
     inputs = {name: (run / name).resolve(strict=True) for name in ("ingest", "rva")}
     folders = {name: out / name for name in ("g0", "checkpoints", "kept")}
     for folder in folders.values():
         folder.mkdir(parents=True, exist_ok=True)
     going_on = any(folders["checkpoints"].iterdir())
-    # `stages` is the package `cleargs.stages`, as it lies in the repository; nothing need be installed.
-    stage = importlib.import_module("stages.g0")
     start = time.perf_counter()
-    result = stage.run(
+    result = g0.run(
         StageContext(
             config=config,
             source=run,
@@ -68,7 +69,7 @@ def train(run: Path, out: Path, config: G0Config, device: Any) -> dict[str, Any]
     )
     seconds = time.perf_counter() - start
     return {
-        "seconds": None if going_on else round(seconds, 1),  # of the whole, decoding and evaluation included
+        "seconds": None if going_on else round(seconds, 1),  # with decoding and evaluation
         **result.summary,
         "psnr_held_out": held_out(inputs["ingest"], folders["g0"], device),
         "peak_memory_gb": round(torch.cuda.max_memory_allocated() / 1e9, 2) if device == "cuda" else None,
@@ -76,7 +77,7 @@ def train(run: Path, out: Path, config: G0Config, device: Any) -> dict[str, Any]
 
 
 def held_out(ingest: Path, scene_folder: Path, device: Any) -> float | None:
-    """Mean PSNR in dB of the frames kept from training; None where there are none."""
+    """Return the mean PSNR in dB of held-out frames; None if there are none."""
     frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "test"]
     views = [view_of(frame, ingest, 1.0) for frame in frames]
     scene = read_ply(scene_folder / "scene.ply").to(device)
@@ -92,8 +93,9 @@ def main() -> None:
     parser.add_argument("--budget", type=int, default=500_000)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cuda")
     arguments = parser.parse_args()
-    config = G0Config(steps=arguments.steps, budget=arguments.budget)
-    found = train(arguments.run, arguments.out, config, arguments.device)
+    config = g0.G0Config(steps=arguments.steps, budget=arguments.budget)
+    run = unpack(arguments.run, arguments.out / "run")
+    found = train(run, arguments.out, config, arguments.device)
     name = torch.cuda.get_device_name() if arguments.device == "cuda" else "cpu"
     found |= {"device": name, "torch": torch.__version__, "python": sys.version.split()[0]}
     (arguments.out / "stages.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")

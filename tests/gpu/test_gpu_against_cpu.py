@@ -1,4 +1,4 @@
-"""The GPU back end against the CPU's on scenes too large for the interpreter; runs on a device only."""
+"""The GPU back end compared with the CPU's, on scenes too large for the interpreter: needs a GPU."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ def test_the_gpu_agrees_with_the_cpu(count, size_px, aspect, antialias, device):
     (image, gradients, visible), (other_image, other_gradients, other_visible) = results
     assert torch.equal(visible, other_visible)
     assert visible.double().mean() > 0.5
-    # A pixel whose alpha lies on the cut may fall on either side: 1/255 of one splat's colour, in very few
-    # pixels.
+    # A pixel whose alpha is on the cut may be on either side: 1/255 of one splat's colour, in few pixels.
     apart = (image - other_image).abs().amax(dim=2)
     assert (apart > 1e-5).double().mean() < 1e-3
     assert apart.max() < 0.05
@@ -58,7 +57,7 @@ def test_the_warp_agrees_with_the_cpu_and_with_itself(motion, device):
         fields = displacement_fields(motion, camera, placed, torch.ones_like(placed), 8)
         warp = Warp.of(fields, 8)
         found.append((warp.forward(image.to(where)).cpu(), warp.transpose(light.to(where)).cpu()))
-    # Positions of up to 640 px in float32 are good to 6e-5 px; about a hundred pixels send light to a place.
+    # Positions of up to 640 px in float32 are exact to 6e-5 px. About a hundred pixels add to one place.
     assert (found[1][0] - found[0][0])[..., :3].abs().max() < 3e-4
     assert (found[1][1] - found[0][1])[..., :3].abs().max() < 1e-3
     assert all(torch.equal(first, second) for first, second in zip(found[1], found[2], strict=True))

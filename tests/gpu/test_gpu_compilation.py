@@ -1,4 +1,4 @@
-"""Every GPU kernel compiles to machine code without a GPU, and spills nothing where it counts."""
+"""Every GPU kernel compiles to machine code without a GPU. The rasteriser spills no registers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KERNELS = FOLDER.parent.parent / "cleargs" / "splat" / "kernels" / "cuda"
 
 
 def launched_kernels() -> set[str]:
-    """The names that the package launches: ``name[grid](...)`` in its sources."""
+    """Return the names that the package launches: ``name[grid](...)`` in its sources."""
     launches = re.compile(r"(\w+)\[(?:grid|\()")
     text = "\n".join(source.read_text(encoding="utf-8") for source in KERNELS.glob("*.py"))
     defined = set(re.findall(r"@triton\.jit[^\n]*\ndef (\w+)\(", text))
@@ -21,7 +21,7 @@ def launched_kernels() -> set[str]:
 
 
 def test_every_kernel_compiles_for_a_gpu() -> None:
-    # In a process of its own: in this one Triton may be in its interpreter's mode, which cannot compile.
+    # In a separate process: in this one Triton may be in interpreter mode, which cannot compile.
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     found = subprocess.run(
         [sys.executable, str(FOLDER / "compile_kernels.py")],
@@ -33,6 +33,5 @@ def test_every_kernel_compiles_for_a_gpu() -> None:
     assert found.returncode == 0, found.stderr[-2000:]
     rows = [line.strip("| ").split(" | ") for line in found.stdout.splitlines()[3:]]
     assert {row[0].split()[0] for row in rows} == launched_kernels()
-    # The rasteriser takes most of the time: what it keeps in registers must stay there (a few bytes of index
-    # apart).
+    # The rasteriser takes most of the time. It must keep its registers, except a few bytes of an index.
     assert all(int(stack) <= 16 for name, _, stack, _ in rows if name.split()[0] in ("forward", "backward"))

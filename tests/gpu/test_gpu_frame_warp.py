@@ -1,4 +1,4 @@
-"""The frame warp on the GPU kernels: against float64 and the CPU's, on hard cases, and inside a training."""
+"""The frame warp on the GPU kernels, compared with the CPU's, and within a training."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Both = Callable[..., tuple[Any, Any]]
 
 @pytest.fixture
 def both(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> Both:
-    """Calls a function of tensors with them on the device, and again with them on the CPU's kernels."""
+    """Return a function that calls another with tensors on the device, then on the CPU's kernels."""
 
     def call(function: Callable[..., Any], *tensors: Tensor) -> tuple[Any, Any]:
         found = function(*(tensor.to(device) for tensor in tensors))
@@ -55,7 +55,7 @@ def test_the_fields_are_those_of_the_cpu(both: Both, margin: int) -> None:
     )
     assert found.sweep.std() > 1.0
     for mine, theirs in zip(found[:3], expected[:3], strict=True):
-        # Up to 8 px, by some ten float32 operations, whose last bits differ: the worst is 5e-7.
+        # Up to 8 px after about ten float32 operations, whose last bits differ: at most 5e-7 observed.
         torch.testing.assert_close(mine.cpu(), theirs, rtol=0.0, atol=1e-5)
     assert enough_samples(found) == enough_samples(expected)
 
@@ -93,7 +93,7 @@ def test_curves_are_those_of_the_cpu(
 
     found, expected = both(follow, values)
     for mine, theirs in zip(found, expected, strict=True):
-        # The same operations, but the CPU's may be fused: the worst is the last bit.
+        # The same operations, which the CPU may fuse: at most the last bit differs.
         torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-6)
     assert not found[2][..., 3].any()
 
@@ -104,7 +104,7 @@ def test_a_training_through_the_warp_follows_the_cpu(
     """A blurred, a rolled and a defocused frame, rendered with a margin."""
     monkeypatch.setattr(splat_toy, "WIDTH", 20)
     monkeypatch.setattr(splat_toy, "HEIGHT", 16)
-    # How the frames were taken is given: a search would tell near ties apart by the last bit.
+    # The motions are given: a search would decide near ties by the last bit.
     monkeypatch.setattr("cleargs.formation.capture.fit_motion", lambda frame, *given, **options: frame)
     rng = np.random.default_rng(0)
     views = splat_toy.views([rng.integers(0, 256, (16, 20, 3), dtype=np.uint8) for _ in range(3)])
@@ -134,7 +134,7 @@ def test_a_training_through_the_warp_follows_the_cpu(
     for name in ("loss", "l1", "ssim", "psnr"):
         expected = on_cpu.rows.column(name).to_pylist()
         assert on_gpu.rows.column(name).to_pylist() == pytest.approx(expected, rel=1e-5), name
-    # The worst is 1e-6, but as in test_gpu_training.py a gradient near 0 may change its sign on a device.
+    # At most 1e-6 observed. On a GPU a gradient near 0 may change its sign, as in test_gpu_training.py.
     for name, tensor in on_cpu.scene.gaussians.tensors().items():
         error = (getattr(on_gpu.scene.gaussians, name) - tensor).abs()
         assert (error < 1e-4).double().mean() > 0.97, name

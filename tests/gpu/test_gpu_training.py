@@ -1,4 +1,4 @@
-"""Densification and training on the GPU's kernels, against the CPU's."""
+"""Densification and training on the GPU's kernels, compared with the CPU's."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def crowd(count, device):
 
 
 def test_a_refinement_is_that_of_the_cpu(device, densify):
-    """Two Gaussians have all of the error: there are places for all that they are cut into, and no draws."""
+    """Two Gaussians have all of the error. There is a place for each of their halves: nothing is drawn."""
     gaussians = crowd(40, device)
     dead = int((gaussians.logit_opacities.sigmoid() <= 0.01).sum())
     assert dead == 13  # 2, 4, and of 8 all but one, which is new, as 16 more are
@@ -58,7 +58,7 @@ def test_a_refinement_is_that_of_the_cpu(device, densify):
     assert grown.num == len(expected["means"]) == 57
     order = np.argsort(grown.means[:, 0].cpu().numpy()), np.argsort(expected["means"][:, 0])
     for name, tensor in grown.tensors().items():
-        # float32 on both sides, but for the opacities.
+        # float32 on both sides, except for the opacities.
         np.testing.assert_allclose(
             tensor.cpu().numpy()[order[0]], expected[name][order[1]], rtol=1e-5, atol=1e-6
         )
@@ -91,7 +91,7 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
     assert not offsets[:10].any()
     rotation = densification.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
     covariance = rotation @ np.diag(np.exp(2.0 * one.log_scales[0].double().numpy())) @ rotation.T
-    # offset = 2 fade Σ draw, so its covariance is 4 fade² Σ²; a sample's entries are good to some per cent.
+    # offset = 2 fade Σ draw, so its covariance is 4 fade² Σ². A sample gives its entries to a few per cent.
     fade = 1.0 / (1.0 + math.exp(-100.0 * (0.005 - 1.0 / (1.0 + math.exp(9.0)))))
     expected = 4.0 * fade**2 * covariance @ covariance
     measured = (offsets[10:].T @ offsets[10:] / (count - 10)).numpy()
@@ -117,7 +117,7 @@ CONFIG = FastGrowth(
 
 @pytest.fixture
 def toy(monkeypatch):
-    """Three random pictures of 20 x 15 px; training needs no more to be compared."""
+    """Return three views of random images of 20 x 15 px."""
     monkeypatch.setattr(splat_toy, "WIDTH", 20)
     monkeypatch.setattr(splat_toy, "HEIGHT", 15)
     rng = np.random.default_rng(0)
@@ -159,7 +159,7 @@ def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_p
 
 
 def test_training_follows_the_cpu(toy, device, tmp_path, monkeypatch):
-    """Without densification, whose random numbers differ, both back ends take the same steps."""
+    """Without densification, which draws other random numbers, both back ends take the same steps."""
     config = CONFIG.model_copy(update={"densify": False, "steps": 3})
     on_gpu = trained_on(device, toy, tmp_path / "gpu", config=config)
     from cleargs.splat.kernels.cuda import support
@@ -170,7 +170,7 @@ def test_training_follows_the_cpu(toy, device, tmp_path, monkeypatch):
     for name in ("loss", "l1", "ssim", "psnr"):
         expected = on_cpu.rows.column(name).to_pylist()
         assert on_gpu.rows.column(name).to_pylist() == pytest.approx(expected, rel=1e-4), name
-    # Adam divides by the root of the second moment, so that a gradient near 0 may change its sign: few do.
+    # Adam divides by the root of the second moment: a gradient near 0 may change its sign. Few do.
     for name, expected in on_cpu.scene.gaussians.tensors().items():
         error = (getattr(on_gpu.scene.gaussians, name) - expected).abs()
         assert (error < 1e-4).double().mean() > 0.97, name

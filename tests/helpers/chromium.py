@@ -1,4 +1,4 @@
-"""Pages in a real browser, from the disk: Debian's Chromium, WebGL in software."""
+"""Pages from disk in a real browser: Debian's Chromium, with WebGL in software."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """The browser."""
+    """Start the browser."""
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
         yield browser
@@ -29,7 +29,7 @@ def chromium() -> Iterator[Any]:
 
 
 class Opened:
-    """A page in the browser, and all that it complained about or asked for."""
+    """A page in the browser, with its errors, warnings and requests."""
 
     def __init__(self, page: Any, address: str) -> None:
         self.page = page
@@ -45,19 +45,19 @@ class Opened:
         if message.type in ("error", "warning"):
             self.complaints.append(message.text)
 
-    def strangers(self) -> list[str]:
-        """What the page asked for that does not lie beside it."""
+    def network_requests(self) -> list[str]:
+        """URLs that the page requested and that are not files next to it."""
         return [url for url in self.requests if not url.startswith(ALLOWED)]
 
 
 def check_page(browser: Any, address: str, size: str) -> None:
-    """Assert that a page fits its screen, shows its images, and asks for nothing that is not next to it."""
+    """Assert that a page fits its screen, shows its images, and requests nothing from a network."""
     scheme = "light" if size == "wide" else "dark"
     page = browser.new_page(viewport=SIZES[size], color_scheme=scheme)
     opened = Opened(page, address)
     page.evaluate("for (const image of document.images) image.loading = 'eager'")
     page.wait_for_function("[...document.images].every((image) => !image.src || image.naturalWidth > 50)")
     assert page.evaluate("document.documentElement.scrollWidth") == SIZES[size]["width"]
-    assert opened.complaints == [] and opened.strangers() == []
+    assert opened.complaints == [] and opened.network_requests() == []
     assert page.evaluate("window.hacked") is None
     page.close()

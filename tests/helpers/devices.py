@@ -1,4 +1,4 @@
-"""Where the GPU's kernels run in a test: on a GPU, or in Triton's interpreter on tensors of the CPU."""
+"""The device of GPU kernels in tests: a GPU, or Triton's interpreter with tensors on the CPU."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 
 def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
-    """Return the device of a test's tensors; from here on every dispatch leads to the GPU's kernels."""
+    """Return the device for a test's tensors, and let the test use the GPU kernels on it."""
     if importlib.util.find_spec("triton") is None:
         pytest.skip("needs Triton: pip install 'cleargs[cuda]'")
     if os.environ.get("TRITON_INTERPRET") == "1":
@@ -25,5 +25,5 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> torch.device:
-    """The device of the test's tensors, once for each back end."""
+    """The device for a test's tensors. The test runs once per back end."""
     return gpu(monkeypatch) if request.param == "cuda" else torch.device("cpu")

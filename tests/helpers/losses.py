@@ -1,4 +1,4 @@
-"""The loss of one image and one step of Adam, by themselves."""
+"""The loss of a single image, and a single step of Adam."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PhotometricLoss(NamedTuple):
 def photometric_loss(
     image: Tensor, target: Tensor, *, ssim_lambda: float, weight: float = 1.0, mask: Tensor | None = None
 ) -> PhotometricLoss:
-    """Return what `LossAccumulator` says of one image."""
+    """Return the result of `LossAccumulator` for one image."""
     gradient = torch.full(image.shape, 7.0, device=image.device)
     losses = LossAccumulator(image.device, ssim_lambda)
     losses.add(0, image, target, mask, weight=weight, gradient=gradient)

@@ -1,4 +1,4 @@
-"""A drawn picture, a slanted wall, and what a moving camera records of it."""
+"""A synthetic image, a slanted wall, and the photos that a moving camera takes of them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MEDIAN = float(np.median(wall()))
 
 
 def wall_fields(motion: FrameMotion) -> DisplacementFields:
-    """Where the pixels of `CAMERA` look at the wall under a motion."""
+    """Displacements of the pixels of `CAMERA`, in front of the wall, by a motion."""
     return displacement_fields(motion, CAMERA, torch.from_numpy(wall()), torch.from_numpy(ALPHA))
 
 
@@ -50,7 +50,7 @@ def picture() -> Image:
 
 
 def observe(truth: Image, motion: FrameMotion, *, noise: float = 1 / 255) -> Image:
-    """What a camera that moves so records, with more samples than the code under test takes."""
+    """The photo of a camera with this motion, with more samples than the tested code uses."""
     warp = Warp(wall_fields(motion), 0, torch.from_numpy(samples(301)))
     light = warp.forward(torch.from_numpy(padded(linear_from_srgb(truth)))).numpy()[..., :3]
     grain = noise * np.random.default_rng(0).standard_normal(truth.shape)
@@ -58,12 +58,12 @@ def observe(truth: Image, motion: FrameMotion, *, noise: float = 1 / 255) -> Ima
 
 
 def soft(image: Image, sigma: float = 0.7) -> Image:
-    """The render of an unfinished scene: smooth, and a little off in its colours."""
+    """An image like the render of an unfinished scene: smooth, with slightly wrong colours."""
     return np.asarray(np.clip(cv2.GaussianBlur(image, (0, 0), sigma) * 0.98 + 0.01, 0, 1), np.float32)
 
 
-def sight(render: Image, observed: Image, weight: Image = ALPHA) -> FramePair:
-    """The raw frame ``observed`` beside the render, without a margin."""
+def frame_pair(render: Image, observed: Image, weight: Image = ALPHA) -> FramePair:
+    """The pair of the raw frame ``observed`` and its render, without a margin."""
     seen = np.where(weight[..., None] > 0, observed, render)
     return FramePair(luminance(render), wall(), ALPHA, luminance(seen), weight, CAMERA, 0)
 

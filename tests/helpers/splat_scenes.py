@@ -1,4 +1,4 @@
-"""Small scenes for the splatting tests, and the comparison of the kernels with the oracle."""
+"""Small scenes for the splatting tests, and the comparison of the kernels with a reference in float64."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BACKGROUND = (0.1, 0.2, 0.3)
 
 
 def make_camera(width: int = 64, height: int = 48, focal: float | None = None) -> Camera:
-    """A camera turned by 0.1 rad about y and off the origin, its principal point off the centre."""
+    """A camera away from the origin, rotated by 0.1 rad about y, with the principal point off the centre."""
     focal = 0.9 * width if focal is None else focal
     angle = 0.1
     pose = np.eye(4)
@@ -37,7 +37,7 @@ def make_gaussians(
     aspect: float = 2.0,
     sh_count: int = 16,
 ) -> Gaussians:
-    """``n`` random Gaussians in and a little beyond the camera's frustum, quaternions not normalised."""
+    """``n`` random Gaussians in the camera's frustum and slightly outside, with unnormalised quaternions."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 10, n)
     u = rng.uniform(-0.1, 1.1, n) * camera.width
@@ -67,10 +67,10 @@ def at(camera: Camera, local: npt.NDArray[np.float64]) -> Tensor:
 def make_needles(
     camera: Camera, n: int, *, length_px: float, aspect: float, distance: float = 0.0
 ) -> Gaussians:
-    """``n`` needles at random angles through random pixels, their centres ``distance`` px from these.
+    """``n`` needles at random angles through random pixels, with centres ``distance`` px from these pixels.
 
-    They lie parallel to the image and have a standard deviation of ``length_px`` along and, before the
-    dilation, of ``length_px`` / ``aspect`` across.
+    They are parallel to the image plane. Their standard deviation is ``length_px`` along the needle, and
+    ``length_px`` / ``aspect`` across it before the dilation.
     """
     gaussians = make_gaussians(camera, n, opacity=(0.1, 0.9))
     rng = np.random.default_rng(n)
@@ -83,7 +83,7 @@ def make_needles(
     axis = np.column_stack([along / focal * z[:, None], np.zeros(n)]) @ camera.world_to_camera[:3, :3]
     world_px = np.linalg.norm(axis, axis=1)  # world units for a px along the needle
     axis /= world_px[:, None]
-    # The rotation that takes the x axis to ``axis``: w = 1 + x · axis, (x, y, z) = x × axis.
+    # The rotation from the x axis to ``axis``: w = 1 + x · axis, (x, y, z) = x × axis.
     turn = np.column_stack([1 + axis[:, 0], np.zeros(n), -axis[:, 2], axis[:, 1]])
     gaussians.rotations[:] = torch.tensor(turn)
     sizes = length_px * world_px[:, None] / np.array([1.0, aspect, aspect])
@@ -93,25 +93,25 @@ def make_needles(
 
 @dataclass
 class Comparison:
-    """Worst errors of the kernels against the oracle."""
+    """Maximum errors of the kernels, compared with the reference."""
 
     image: float  # max |error| of image and alpha
     depth: float  # max |error| relative to the largest depth
     gradients: dict[str, float]  # max |error| / max |gradient| of each parameter
-    alpha: Tensor  # [H, W] of the oracle
+    alpha: Tensor  # [H, W], from the reference
     gradient_sizes: dict[str, float]  # max |gradient|
-    fragile: float  # share of pixels left out because a float32 may fall on the other side of a cut-off
+    fragile: float  # share of ignored pixels, where float32 may be on the other side of a cut-off
 
 
 def leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
-    """Copies that collect gradients."""
+    """Copies of the parameters that collect gradients."""
     return Gaussians(
         *(tensor.detach().to(dtype).clone().requires_grad_() for tensor in gaussians.tensors().values())
     )
 
 
-# float32 resolves 6e-8. Blending some tens of splats, and 2^x (a polynomial of relative error 1e-6 on a CPU,
-# 2 ulp on a GPU), gave at most 1.4e-6 in the image and 3.3e-6 of the largest gradient over ordinary scenes.
+# float32 has a precision of 6e-8. Blending tens of splats and 2^x (a polynomial of relative error 1e-6 on a
+# CPU, 2 ulp on a GPU) gave errors up to 1.4e-6 in the image, and up to 3.3e-6 of the largest gradient.
 IMAGE_TOLERANCE = 3e-6
 GRADIENT_TOLERANCE = 1e-5
 
@@ -119,7 +119,7 @@ GRADIENT_TOLERANCE = 1e-5
 def assert_close(
     result: Comparison, image: float = IMAGE_TOLERANCE, gradient: float = GRADIENT_TOLERANCE
 ) -> None:
-    """Hold a comparison to tolerances, on nearly all pixels."""
+    """Assert that the errors are within the tolerances, and that few pixels are ignored."""
     assert result.fragile < 0.05
     assert result.image < image
     assert result.depth < image
@@ -136,10 +136,10 @@ def compare(
     sh_degree: int | None = None,
     margin: float = 2e-5,
 ) -> Comparison:
-    """Render with kernels and oracle and differentiate a random linear functional of all three outputs.
+    """Render with kernels and reference, and differentiate a random linear functional of all three outputs.
 
-    Pixels where an alpha lies within ``margin`` (relative) of 1/255, or a transmittance of 1e-4, are left
-    out: there the image is discontinuous and float32 may decide the other way.
+    Pixels are ignored if an alpha is within ``margin`` (relative) of 1/255, or a transmittance of 1e-4: the
+    image is discontinuous there, so float32 may differ.
     """
     from benchmarks.speed import reference
     from cleargs.splat.kernels.rasteriser import sh_count

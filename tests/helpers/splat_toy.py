@@ -1,4 +1,4 @@
-"""A tiny scene with known Gaussians, seen by a ring of cameras: what training tests learn."""
+"""A tiny scene with known Gaussians and a ring of cameras, for the tests of trainings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def camera(angle: float) -> Camera:
 
 
 def images(truth: Gaussians, count: int) -> list[Image]:
-    """What the cameras at ``count`` angles over half a circle see of ``truth``, as uint8."""
+    """Renders of ``truth``, as uint8, by cameras at ``count`` angles over half a circle."""
     engine = rasteriser_for("cpu")
     shown = [engine.forward(truth, camera(angle)).image.numpy().copy() for angle in angles(count)]
     return [np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8) for image in shown]
@@ -53,7 +53,7 @@ def angles(count: int) -> list[float]:
 
 
 def views(pictures: list[Image], *, weights: list[float] | None = None) -> list[TrainingView]:
-    """Real views of the pictures, in the order of `images`."""
+    """Real views of the images, in the order of `images`."""
     weights = weights or [1.0] * len(pictures)
     return [
         TrainingView(index, camera(angle), weight, "real", keep(picture))
@@ -66,7 +66,7 @@ def views(pictures: list[Image], *, weights: list[float] | None = None) -> list[
 def keep(
     picture: Image, mask: NDArray[np.bool_] | None = None
 ) -> Callable[[], tuple[Image, NDArray[np.bool_] | None]]:
-    """A loader that gives a picture from memory."""
+    """A loader that returns an image from memory."""
     return lambda: (picture, mask)
 
 
@@ -76,7 +76,7 @@ def refuse() -> tuple[Image, None]:
 
 
 def start(count: int = 60, *, sh_degree: int = 0) -> Scene:
-    """Where a toy training starts: other Gaussians than the truth, half transparent."""
+    """The start of a toy training: other Gaussians than the truth, half transparent."""
     begin = gaussians(count, seed=99, sh_degree=sh_degree)
     begin.logit_opacities.zero_()
     return Scene(begin)

@@ -1,4 +1,4 @@
-"""What a frame's warp should give, in float64, and motions and fields to try it on."""
+"""A reference of a frame's warp in float64, with motions and displacement fields to test it on."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ LONG = FrameMotion(blur=twist(2, 1, -1, 4, 19, 2), skew=twist(1, 0, 2, 3, 5, -2)
 
 
 def tent(distance: Tensor) -> Tensor:
-    """Linear interpolation's share of a pixel at a distance."""
+    """Weight of a pixel at a distance in linear interpolation."""
     return (1 - distance.abs()).clamp(min=0)
 
 
 def keys(distance: Tensor) -> Tensor:
-    """The share that cubic convolution gives a pixel at a distance, as Keys (1981) writes it for a = -1/2."""
+    """Weight of a pixel at a distance in cubic convolution (Keys 1981, a = -1/2)."""
     d = distance.abs()
     near, far = 1.5 * d**3 - 2.5 * d**2 + 1, -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2
     return torch.where(d <= 1, near, torch.where(d < 2, far, torch.zeros_like(d)))
 
 
 def oracle(image: Tensor, warp: Warp) -> Tensor:
-    """What `Warp.forward` should give, in float64 torch with autograd; ``image`` of it are its pixels."""
+    """The expected result of `Warp.forward`, in float64 with autograd. Its ``image`` are the input pixels."""
     pixels = image.detach().double().cpu().requires_grad_()
-    seen = mean_of_looks(pixels, warp.fields, warp.margin, warp.samples)
+    seen = mean_of_samples(pixels, warp.fields, warp.margin, warp.samples)
     if warp.between is not None:
-        seen = mean_of_looks(seen, warp.between.fields, 0, warp.between.samples)
+        seen = mean_of_samples(seen, warp.between.fields, 0, warp.between.samples)
     seen.image = pixels  # type: ignore[attr-defined]
     return seen
 
 
-def mean_of_looks(pixels: Tensor, fields: DisplacementFields, margin: int, points: Tensor) -> Tensor:
-    """What every pixel sees between pixels, on the average of the samples."""
+def mean_of_samples(pixels: Tensor, fields: DisplacementFields, margin: int, points: Tensor) -> Tensor:
+    """Mean over the samples of the interpolated image at the displaced positions."""
     rows, columns = pixels.shape[:2]
     height, width = fields.radius.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -88,11 +88,11 @@ def dot(a: Tensor, b: Tensor) -> float:
 
 SMALL = Camera(30, 18, 25.0, 26.0, 14.0, 9.5, np.eye(4))
 SCALE = 0.25
-"""Of a small photograph over that of `ALL`, whose blur is 10 px long."""
+"""Size of the small image relative to that of `ALL`, whose blur is 10 px long."""
 
 
 def scenery(margin: int) -> tuple[Tensor, Tensor]:
-    """Accumulated depth and alpha: an edge, a floater, holes, and what is no number."""
+    """Accumulated depth and alpha with an edge, a floater, holes, NaN and infinity."""
     height, width = SMALL.height + 2 * margin, SMALL.width + 2 * margin
     depth = torch.full((height, width), 3.0)
     depth[:, width // 2 :] = 1.5

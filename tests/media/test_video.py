@@ -303,5 +303,5 @@ def test_a_title_in_another_encoding(tmp_path: Path, suffix: str) -> None:
 
 def test_a_fifo_is_no_video(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "v.mp4")
-    with pytest.raises(InputError, match="no regular file"):
+    with pytest.raises(InputError, match="not a regular file"):
         read_timeline(tmp_path / "v.mp4")

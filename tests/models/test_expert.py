@@ -1,4 +1,4 @@
-"""The tile runner, ONNX experts and the shipped restoration network."""
+"""Tiling, ONNX experts and the embedded restoration network."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def noise_image(height: int, width: int, seed: int = 0) -> Image:
 
 
 def drawing(height: int, width: int, seed: int = 0) -> Image:
-    """Crisp overlapping discs and bars on a gradient: edges of every direction and contrast."""
+    """Draw crisp overlapping discs and bars on a gradient: edges of all directions and contrasts."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     image = np.stack([0.3 + 0.4 * x / width, 0.4 + 0.2 * y / height, 0.5 - 0.2 * x / width], axis=-1)
@@ -77,7 +77,7 @@ def test_identity_returns_the_image(size: tuple[int, int], fixed: tuple[int | No
 
 
 def test_tiles_keep_their_place() -> None:
-    # Each tile is darkened where it is: a misplaced or transposed tile would show.
+    # Each tile is inverted, so a misplaced or transposed tile would be visible.
     image = noise_image(300, 500)
     np.testing.assert_allclose(apply_tiled(lambda t: 1 - t, image, fixed=(96, 128)), 1 - image, atol=1e-6)
 
@@ -96,12 +96,12 @@ def test_free_tiles_have_sides_that_encoders_can_halve() -> None:
 
 
 def test_seams_are_smooth() -> None:
-    # Tiles that disagree (each returns its own mean) must meet in a ramp, not in a step.
+    # Tiles with different results (each returns its mean) must be blended with a ramp, not a step.
     image = np.broadcast_to(np.linspace(0, 1, 700, dtype=np.float32)[None, :, None], (64, 700, 3)).copy()
     blended = apply_tiled(lambda tile: np.full_like(tile, tile.mean()), image, fixed=(64, 256))
-    means = 256 / 700  # difference of neighbouring tiles' means, at most
+    means = 256 / 700  # maximum difference between the means of neighbouring tiles
     assert blended.std() > 0.1
-    # A raised cosine over the shortest overlap, 32 pixels, climbs by at most pi/2 / 32 of it a pixel.
+    # A raised cosine over the shortest overlap, 32 pixels, rises by at most pi/2 / 32 of it per pixel.
     assert np.abs(np.diff(blended, axis=1)).max() < means * np.pi / 2 / 32 * 1.05
 
 
@@ -132,17 +132,17 @@ def test_any_size(size: tuple[int, int]) -> None:
     assert restored.max() <= 1.0
 
 
-def test_tiling_hardly_shows() -> None:
-    # The network sees a bounded neighbourhood; away from tile borders it computes the same in any tile.
+def test_tiling_is_almost_invisible() -> None:
+    # The receptive field is bounded, so results away from tile borders do not depend on the tile.
     image = drawing(192, 704)
     expert = OnnxExpert(model_file("embedded", "expert"))
     whole = expert._restore(image[None])[0]
     assert psnr(expert.restore(image), np.clip(whole, 0, 1)) > 50
 
 
-def test_sharp_images_are_left_alone() -> None:
+def test_sharp_images_change_little() -> None:
     image = drawing(256, 256)
-    # The photographs' target is 38 dB.
+    # 38 dB is the target for photographs.
     assert psnr(load_expert("embedded").restore(image), image) > 38
 
 
@@ -157,7 +157,7 @@ def test_motion_blur_is_reduced(length: float) -> None:
         blurred = degrade(sharp, Degradation(kernel=motion_kernel(rng, length), noise=0.5 / 255), rng)
         restored = expert.restore(blurred)
         gains.append(psnr(restored[inner], sharp[inner]) - psnr(blurred[inner], sharp[inner]))
-    # Drawings are unlike the photographs of the training; measured means: 0.67, 0.56 and 0.37 dB.
+    # Drawings differ from the training photographs. Measured means: 0.67, 0.56 and 0.37 dB.
     assert min(gains) > 0.0
     assert np.mean(gains) > 0.2
 
@@ -174,7 +174,7 @@ def test_missing_file() -> None:
     assert caught.value.hint
 
 
-def test_file_that_is_no_model(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_model_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.onnx"
     path.write_bytes(b"not a model")
     with pytest.raises(InputError, match="not an ONNX model"):

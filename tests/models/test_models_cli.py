@@ -40,7 +40,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def model_for(archive: Path, **digests: str) -> RegistryEntry:
-    """The registry's LPIPS entry with the digests of an archive of our own."""
+    """Return the LPIPS entry of the registry, with the digests of a test archive."""
     entry = find_model("lpips")
     assert entry.source is not None
     files = tuple(InstalledFile(name=weights_file(net), digest=digests.get(net, "0" * 64)) for net in NETS)
@@ -81,7 +81,7 @@ def test_install_verify_and_damage(archive: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="damaged"):
         installer.install(
             model_for(archive), tmp_path, archive
-        )  # converted, but not to what the registry says
+        )  # converted, but the digests differ from the registry
     assert list(tmp_path.iterdir()) == []
 
     converted = convert_sdist(archive.read_bytes(), tmp_path)
@@ -116,7 +116,7 @@ def test_wrong_archive_is_refused_before_it_is_opened(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_offline_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_download_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     commands: list[list[str]] = []
 
     def offline(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
@@ -132,7 +132,7 @@ def test_offline_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_shipped_models_need_no_installation(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="comes with"):
+    with pytest.raises(InputError, match="is included"):
         installer.install(find_model("clarity-net"), tmp_path)
 
 
@@ -167,7 +167,7 @@ def test_checkpoint_hint_names_the_tool(name: str, tmp_path: Path) -> None:
 # --- by name ----------------------------------------------------------------------------------------------
 
 
-def test_settings_name_installed_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_models_of_settings_must_be_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path))
     with pytest.raises(InputError, match="not installed") as caught:
         model_file("nafnet-gopro", "expert")
@@ -177,7 +177,7 @@ def test_settings_name_installed_models(tmp_path: Path, monkeypatch: pytest.Monk
     assert "--accept-licence" in caught.value.hint
 
     file = tmp_path / "nafnet-gopro.onnx"
-    file.write_bytes(model_file("embedded", "expert").read_bytes())  # a sound model, but another one
+    file.write_bytes(model_file("embedded", "expert").read_bytes())  # a valid model, but a different one
     assert model_file("nafnet-gopro", "expert") == file
     with pytest.raises(InputError, match="damaged"):
         load_expert("nafnet-gopro")
@@ -185,10 +185,10 @@ def test_settings_name_installed_models(tmp_path: Path, monkeypatch: pytest.Monk
     assert model_file("nets/own.onnx", "expert") == Path("nets/own.onnx").absolute()
     nonesuch: list[tuple[str, Role]] = [("nonesuch", "scorer"), ("nonesuch", "expert"), ("musiq", "expert")]
     for name, role in nonesuch:
-        with pytest.raises(InputError, match=f"there is no .* '{name}'"):  # a scorer is no expert
+        with pytest.raises(InputError, match=f"there is no .* '{name}'"):  # scorers are not experts
             model_file(name, role)
 
 
-def test_what_ships_is_listed_under_the_name_that_settings_take() -> None:
+def test_default_models_are_included() -> None:
     shipped = {model.name for model in load_registry() if model.shipped is not None}
     assert RivrConfig().expert in shipped and RivrConfig().primary_scorer in shipped

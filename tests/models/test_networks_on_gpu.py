@@ -1,4 +1,4 @@
-"""Where networks run when the work runs on a GPU, and batches that fit there; without one."""
+"""Device of networks in runs on a GPU, and batches that fit its memory, tested without a GPU."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def warnings() -> list[str]:
 
 @pytest.fixture
 def with_provider(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An onnxruntime that was built with the provider; here it cannot load."""
+    """Simulate an onnxruntime with the CUDA provider, which cannot load here."""
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [CUDA_PROVIDER])
 
 
-def test_work_on_the_cpu_asks_for_nothing(warnings: list[str], with_provider: None) -> None:
+def test_cpu_work_gives_no_warning(warnings: list[str], with_provider: None) -> None:
     assert network_device("cpu", warnings.append) == "cpu"
     assert not warnings
 
 
-def test_without_the_provider_the_cpu_serves(warnings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_provider_the_cpu_is_used(warnings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
     assert network_device("cuda", warnings.append) == "cpu"
     assert len(warnings) == 1
@@ -42,7 +42,7 @@ def test_without_the_provider_the_cpu_serves(warnings: list[str], monkeypatch: p
 
 
 @pytest.mark.parametrize("retries", [False, True])
-def test_a_provider_that_does_not_load_gives_way_with_one_line(
+def test_a_provider_that_does_not_load_gives_one_warning(
     retries: bool,
     warnings: list[str],
     with_provider: None,
@@ -52,7 +52,7 @@ def test_a_provider_that_does_not_load_gives_way_with_one_line(
     create = onnxruntime.InferenceSession._create_inference_session
 
     def fail(session: Any, providers: Any, *rest: Any) -> None:
-        # onnxruntime tries again by itself, with the same provider where it has TensorRT's too.
+        # onnxruntime retries by itself, with the same provider if it also has that of TensorRT.
         session._fallback_providers = ["CPUExecutionProvider"] if retries else providers
         if any(CUDA_PROVIDER in provider for provider in providers):
             raise RuntimeError("libcudnn.so.9: cannot open shared object file")
@@ -63,7 +63,7 @@ def test_a_provider_that_does_not_load_gives_way_with_one_line(
     assert len(warnings) == 1
     assert "does not load" in warnings[0]
     assert OnnxModel(model_file("embedded", "expert"), "cuda").device == "cpu"
-    assert capsys.readouterr().out == ""  # where results go
+    assert capsys.readouterr().out == ""  # stdout is for results
 
 
 def test_a_provider_that_loads_is_used(
@@ -125,7 +125,7 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch: pytest.MonkeyPatch) ->
     assert [result[0, 0] for result in results] == list(range(5))
 
 
-def test_one_item_that_does_not_fit_and_other_failures_are_errors() -> None:
+def test_failures_of_single_items_are_errors() -> None:
     def exhausted(batch: Floats) -> Floats:
         raise MemoryError("CUDA error: out of memory")
 
@@ -149,6 +149,6 @@ def test_batches_restore_and_score_as_single_tiles_do(monkeypatch: pytest.Monkey
     single, score = expert.restore(image), scorer.score(image)
     monkeypatch.setattr(OnnxModel, "takes_batches", True)
     together = expert.restore(image)
-    # The sums of a convolution may take another order in a batch.
+    # The order of the sums in a convolution may differ in a batch.
     np.testing.assert_allclose(together, single, atol=1e-5)
     assert scorer.score(image) == pytest.approx(score, abs=1e-4)

@@ -1,4 +1,4 @@
-"""ONNX files of other people: one file is the whole model, and what cannot run is an error of one line."""
+"""ONNX files of users: one file is the whole model, and files that cannot run give an error of one line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def varint(number: int) -> bytes:
 
 
 def field(number: int, value: int | str | bytes) -> bytes:
-    """A field of a protocol buffer."""
+    """Encode a field of a protocol buffer."""
     if isinstance(value, int):
         return varint(number << 3) + varint(value)
     data = value.encode() if isinstance(value, str) else value
@@ -29,13 +29,13 @@ def field(number: int, value: int | str | bytes) -> bytes:
 
 
 def image(name: str) -> bytes:
-    """An input or output [1, 3, h, w]."""
+    """Encode an input or output [1, 3, h, w]."""
     shape = b"".join(field(1, extent) for extent in (field(1, 1), field(1, 3), field(2, "h"), field(2, "w")))
     return field(1, name) + field(2, field(1, field(1, 1) + field(2, shape)))
 
 
 def multiplier(weights: bytes, *, as_attribute: bool = False) -> bytes:
-    """A model y = x * w for [1, 3, h, w], with the three weights as ``weights`` says."""
+    """Encode a model y = x * w for [1, 3, h, w], with the tensor data of the three weights."""
     tensor = b"".join(field(1, extent) for extent in (1, 3, 1, 1)) + field(2, 1) + field(8, "w") + weights
     graph = field(11, image("x")) + field(12, image("y")) + field(2, "g")
     if as_attribute:
@@ -58,24 +58,24 @@ def test_the_model_of_these_tests_runs(tmp_path: Path) -> None:
 def test_weights_in_another_file_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, location: str, as_attribute: bool
 ) -> None:
-    """They are in no digest: a change of them would be taken for done."""
+    """The digest does not cover other files, so a change in them would not be noticed."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sub").mkdir()
     (tmp_path / "weights.bin").write_bytes(WEIGHTS)
     entry = field(13, field(1, "location") + field(2, location.format(folder=tmp_path)))
     (tmp_path / "m.onnx").write_bytes(multiplier(entry + field(14, 1), as_attribute=as_attribute))
-    with pytest.raises(InputError, match="it keeps weights in other files"):
+    with pytest.raises(InputError, match="it stores weights in other files"):
         OnnxModel(tmp_path / "m.onnx")
 
 
-def test_a_fifo_is_no_model(tmp_path: Path) -> None:
+def test_a_fifo_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "m.onnx")
-    with pytest.raises(InputError, match="no regular file"):
+    with pytest.raises(InputError, match="not a regular file"):
         OnnxModel(tmp_path / "m.onnx")
 
 
-def test_a_model_that_wants_more_memory_than_there_is(tmp_path: Path) -> None:
-    """Asked for 2^50 values, onnxruntime speaks of a failed allocation; that is no fault of the file."""
+def test_a_model_that_exceeds_memory_raises_memory_error(tmp_path: Path) -> None:
+    """For 2^50 values onnxruntime reports a failed allocation, which is not an error in the file."""
     dims = field(1, 1) + field(2, 7) + field(8, "n") + field(9, struct.pack("<q", 2**50))
     graph = field(5, field(1, 1) + dims[2:]) + field(2, "g")
     graph += field(1, field(1, "n") + field(2, "y") + field(4, "ConstantOfShape"))

@@ -1,4 +1,4 @@
-"""The no-reference scorers and their tiles."""
+"""No-reference scorers and their tiles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.models.naturalness import Quadratic, StatisticsScorer, expected, features, terms
+from cleargs.models.naturalness import Quadratic, StatisticsScorer, expected_value, features, terms
 from cleargs.models.scorer import (
     CLARITY,
     NATURALNESS,
@@ -30,11 +30,9 @@ Image = NDArray[np.float32]
 
 
 def dead_leaves(seed: int, height: int = 200, width: int = 320) -> Image:
-    """Opaque discs of all sizes, each with a fine texture of its own: the classical stand-in for a
-    photograph.
-    """
+    """Draw opaque discs of all sizes with fine textures, a standard model of natural images."""
     rng = np.random.default_rng(seed)
-    scale = 3  # drawn larger and reduced, so that edges are as soft as a camera's
+    scale = 3  # the image is drawn larger and reduced, so that its edges are as soft as those of a camera
     canvas = np.full((scale * height, scale * width, 3), 0.5, np.float32)
     texture = cv2.GaussianBlur(rng.standard_normal(canvas.shape[:2], np.float32), (0, 0), 2.0)
     texture /= texture.std()
@@ -59,7 +57,7 @@ def scorer(request: pytest.FixtureRequest) -> Scorer:
     return load_scorer(request.param)
 
 
-def test_faults_cost_points(scorer: Scorer, leaves: Image) -> None:
+def test_degradations_lower_the_score(scorer: Scorer, leaves: Image) -> None:
     rng = np.random.default_rng(5)
     clean = scorer.score(leaves)
     blurred = cv2.GaussianBlur(leaves, (0, 0), 2.5)
@@ -68,7 +66,7 @@ def test_faults_cost_points(scorer: Scorer, leaves: Image) -> None:
         "noise": np.clip(leaves + 0.1 * rng.standard_normal(leaves.shape, np.float32), 0, 1),
         "splats": artefacts.splat(leaves, rng, spacing=5.0, stretch=4.0),
     }
-    # One point is the margin at which RIVR stops asking the other scorer; these faults are far beyond it.
+    # RIVR uses the second scorer for differences below one point; these degradations cost much more.
     for name, image in faulty.items():
         assert scorer.score(image) < clean - 3.0, name
 
@@ -89,8 +87,8 @@ def test_names_and_digests(scorer: Scorer) -> None:
     assert load_scorer(CLARITY).digest != load_scorer(NATURALNESS).digest
 
 
-def test_score_hardly_depends_on_the_size_of_the_image(scorer: Scorer, leaves: Image) -> None:
-    """Four copies side by side hold the same texture (the seams add a little)."""
+def test_the_score_depends_little_on_the_image_size(scorer: Scorer, leaves: Image) -> None:
+    """Four copies side by side have the same texture, except at the seams."""
     mirrored = np.concatenate([leaves, leaves[:, ::-1]], axis=1)
     mirrored = np.concatenate([mirrored, mirrored[::-1]], axis=0)
     assert scorer.score(mirrored) == pytest.approx(scorer.score(leaves), abs=2.0)
@@ -102,8 +100,8 @@ def test_small_and_odd_sizes(scorer: Scorer, leaves: Image, height: int, width: 
 
 
 @pytest.mark.parametrize("value", [0.0, 0.2, 0.5, 1.0])
-def test_flat_images_score_at_the_bottom(scorer: Scorer, value: float) -> None:
-    """Black was 96.5 to clarity-net and 103 to the statistics."""
+def test_flat_images_score_near_zero(scorer: Scorer, value: float) -> None:
+    """Without the factor, clarity-net gave black 96.5 and the statistics gave it 103."""
     assert scorer.score(np.full((64, 96, 3), value, np.float32)) == 0.0
     rounded = np.round(value * 255 + np.random.default_rng(0).uniform(-0.49, 0.49, (64, 96, 3))) / 255
     assert scorer.score(np.clip(rounded, 0, 1).astype(np.float32)) < 5.0
@@ -112,18 +110,18 @@ def test_flat_images_score_at_the_bottom(scorer: Scorer, value: float) -> None:
 def test_a_frame_half_black_has_half_its_score(scorer: Scorer, leaves: Image) -> None:
     half = leaves[:192].copy()
     half[:, :160] = 0.0
-    # Blocks of 16 px divide the frame; the scorer's own opinion of the black half is all that differs.
+    # The edge is at a border of blocks (16 px), so only the scorer's rating of the black half differs.
     assert scorer.score(half) == pytest.approx(0.5 * scorer.score(leaves[:192]), abs=5.0)
 
 
 @pytest.mark.parametrize("gain", [1.5, 2.0, 3.0, 8.0])
-def test_clipping_costs_points(scorer: Scorer, leaves: Image, gain: float) -> None:
-    """The statistics gave a frame of the real captures up to 11 points more when it was overexposed."""
+def test_clipping_lowers_the_score(scorer: Scorer, leaves: Image, gain: float) -> None:
+    """Without the factor, the statistics rated overexposed real frames up to 11 points higher."""
     clipped = np.clip(leaves * np.float32(gain), 0, 1)
     assert scorer.score(clipped) < scorer.score(leaves)
 
 
-def test_the_share_of_information_is_one_for_a_frame_and_changes_gradually(leaves: Image) -> None:
+def test_information_is_one_for_frames_and_continuous(leaves: Image) -> None:
     assert information(leaves) == 1.0
     faded = [
         information((leaves * np.float32(w)) + np.float32(0.5 * (1 - w))) for w in np.linspace(0, 0.1, 41)
@@ -136,7 +134,7 @@ def test_the_share_of_information_is_one_for_a_frame_and_changes_gradually(leave
 
 
 def images() -> st.SearchStrategy[Image]:
-    """Noise of any mean and strength, fine or coarse, clipped to the range."""
+    """Generate noise of any mean, strength and grain size, clipped to [0, 1]."""
 
     def make(seed: int, mean: float, strength: float, cell: int) -> Image:
         noise = np.random.default_rng(seed).standard_normal((64, 96, 3), np.float32)[::cell, ::cell]
@@ -149,19 +147,19 @@ def images() -> st.SearchStrategy[Image]:
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(image=images())
-def test_scores_keep_to_their_range(scorer: Scorer, image: Image) -> None:
+def test_scores_are_in_range(scorer: Scorer, image: Image) -> None:
     assert 0.0 <= scorer.score(image) <= 100.0
 
 
 @given(a=st.floats(-3, 3), b=st.floats(-3, 3))
-def test_the_expected_figure_is_in_its_range_and_keeps_the_order(a: float, b: float) -> None:
-    low, high = expected(min(a, b)), expected(max(a, b))
+def test_expected_value_is_in_range_and_monotonic(a: float, b: float) -> None:
+    low, high = expected_value(min(a, b)), expected_value(max(a, b))
     assert -1e-12 <= low <= high <= 1.0 + 1e-12
     if -0.2 <= min(a, b) < max(a, b) - 1e-3 and max(a, b) <= 1.2:
-        assert low < high  # no saturation where predictions lie
+        assert low < high  # no saturation in the range of predictions
 
 
-def test_any_scorer_is_cut_to_the_range(leaves: Image) -> None:
+def test_scores_of_any_scorer_are_clipped(leaves: Image) -> None:
     class Fixed:
         name, digest = "fixed", "none"
 
@@ -172,7 +170,7 @@ def test_any_scorer_is_cut_to_the_range(leaves: Image) -> None:
             return self.value
 
     assert [InformedScorer(Fixed(value)).score(leaves) for value in (-3.0, 40.0, 107.0)] == [0.0, 40.0, 100.0]
-    with pytest.raises(InputError, match="fixed gave nan"):
+    with pytest.raises(InputError, match="fixed returned nan"):
         InformedScorer(Fixed(np.nan)).score(leaves)
 
 
@@ -185,7 +183,7 @@ def test_refuses_other_shapes(scorer: Scorer, shape: tuple[int, ...]) -> None:
 @pytest.mark.parametrize(
     ("image", "cause"),
     [
-        (np.full((64, 64, 3), 128, np.uint8), "uint8 values"),  # had a score, a wrong one
+        (np.full((64, 64, 3), 128, np.uint8), "uint8 values"),  # once had a wrong score
         (np.full((64, 64, 3), 0.5), "float64 values"),
         (np.full((64, 64, 3), 128, np.float32), "from 128 to 128"),
         (np.full((64, 64, 3), -0.5, np.float32), "from -0.5 to -0.5"),
@@ -213,7 +211,7 @@ def test_unknown_scorers(tmp_path: Path) -> None:
         load_scorer(str(tmp_path / "broken.onnx"))
 
 
-def test_a_restorer_is_no_scorer() -> None:
+def test_a_restorer_is_not_a_scorer() -> None:
     weights = Path(__file__).parents[2] / "cleargs" / "models" / "weights" / "restorer.onnx"
     with pytest.raises(InputError, match="one score"):
         LearnedScorer(weights)
@@ -242,15 +240,15 @@ def test_quadratic_terms() -> None:
     assert Quadratic(mean=(1.0,), deviation=(1.0,), weights=(1.0, 2.0, 3.0))(np.array([2.0])) == 6.0
 
 
-def test_features_tell_direction_of_change(leaves: Image) -> None:
+def test_features_show_the_direction_of_change(leaves: Image) -> None:
     """Blur raises the correlation of neighbours, noise lowers it."""
     tile = leaves[:128, :128]
-    neighbour = 2  # the larger of the correlations one pixel on
+    neighbour = 2  # the larger correlation at a distance of one pixel
     rng = np.random.default_rng(0)
     noisy = np.clip(tile + 0.05 * rng.standard_normal(tile.shape, np.float32), 0, 1)
     blurred = cv2.GaussianBlur(tile, (0, 0), 1.5)
     assert features(noisy)[neighbour] < features(tile)[neighbour] < features(blurred)[neighbour]
 
 
-def test_the_shipped_statistics_load() -> None:
+def test_the_included_statistics_load() -> None:
     assert StatisticsScorer().name == NATURALNESS

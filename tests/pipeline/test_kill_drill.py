@@ -1,6 +1,6 @@
-"""A run and `gc` killed again and again, beside each other: the results are those of an undisturbed run.
+"""A run and `gc` are killed many times while both run: the results are those of an undisturbed run.
 
-Bounded here; ``CLEARGS_KILLS=50`` makes it a longer drill.
+``CLEARGS_KILLS=50`` makes the test longer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def test_runs_and_collections_are_killed_at_any_moment(bench: Bench) -> None:
     bench.folder.rename(bench.root / "undisturbed")
     chance = random.Random(11)
     for number in range(KILLS):
-        # Two variants, so that there is always something that no link shows any more.
+        # Two variants, so that there are always results without a link.
         power = f"square.power={2 + number % 2}"
         processes = [start(bench, "square.delay_s=0.02", power)]
         if bench.store.is_dir():

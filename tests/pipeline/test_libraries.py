@@ -1,4 +1,4 @@
-"""Which libraries a key names: those that compute, by what was installed and where it runs."""
+"""A key names the libraries that affect results on its device, with the installed versions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cleargs.pipeline.keys import library_versions
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """What is installed."""
+    """Replace the installed distributions."""
     versions = {"onnxruntime-gpu": "1.31.0", "triton": "3.4.0"}
 
     def version(name: str) -> str:
@@ -28,7 +28,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     return versions
 
 
-def test_onnxruntime_is_named_as_it_was_installed_and_runs(
+def test_onnxruntime_is_named_with_distribution_and_device(
     known: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert runtime_version("cpu") == "onnxruntime-gpu 1.31.0, on cpu"

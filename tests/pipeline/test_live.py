@@ -1,4 +1,4 @@
-"""The note of what a run is at work on: there while it works, gone afterwards, and in nobody's way."""
+"""The progress file exists while a run works, and affects nothing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cleargs.pipeline.live import PROGRESS_FILE, RunningStage, preview_of, recor
 from cleargs.progress import SilentReporter
 
 
-def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_active_run_is_visible_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     hold = bench.root / "hold"
     hold.touch()
     assert running_stage(bench.folder, bench.store) is None
@@ -36,13 +36,13 @@ def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.Captur
     assert preview is not None and preview.path.read_bytes() == b"new"
     assert invoke(["show", str(bench.folder)], bench.dag) == 0
     said = capsys.readouterr().out
-    assert "square is at work: square" in said and f"preview: {preview.path}" in said
+    assert "square is running: square" in said and f"preview: {preview.path}" in said
     hold.unlink()
     assert process.wait(60) == 0
     assert running_stage(bench.folder, bench.store) is None and not (bench.folder / PROGRESS_FILE).exists()
 
 
-def test_a_killed_run_is_not_at_work(bench: Bench) -> None:
+def test_a_killed_run_is_not_active(bench: Bench) -> None:
     hold = bench.root / "hold"
     hold.touch()
     process = start(bench, f"square.hold={hold}")
@@ -66,7 +66,7 @@ def test_a_killed_run_is_not_at_work(bench: Bench) -> None:
         {"more": 1},
     ],
 )
-def test_a_damaged_note_says_nothing(
+def test_a_damaged_progress_file_is_ignored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
 ) -> None:
     monkeypatch.setattr(live, "writer_is_alive", lambda work: True)
@@ -79,8 +79,8 @@ def test_a_damaged_note_says_nothing(
     assert running_stage(tmp_path, tmp_path) is None
 
 
-def test_the_task_that_was_told_of_last_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "EVERY", 0.0)
+def test_the_task_that_advanced_last_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "WRITE_INTERVAL_S", 0.0)
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     with recorded_progress(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
@@ -105,7 +105,7 @@ def test_the_task_that_was_told_of_last_is_noted(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / PROGRESS_FILE).exists()
 
 
-def test_a_note_that_cannot_be_written_stops_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unwritable_progress_file_stops_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, value: Any) -> None:
         raise StoreError("no space left", hint="")
 
@@ -113,8 +113,7 @@ def test_a_note_that_cannot_be_written_stops_nothing(bench: Bench, monkeypatch: 
     assert [outcome.how for outcome in bench.run()] == ["made"] * 3
 
 
-def test_a_note_is_no_sign_of_a_checkpoint(bench: Bench) -> None:
-    """A job near its time limit is stopped when its work folder has a younger file."""
+def test_the_progress_file_is_not_in_the_work_folder(bench: Bench) -> None:
     hold = bench.root / "hold"
     hold.touch()
     process = start(bench, f"square.hold={hold}")

@@ -1,4 +1,4 @@
-"""Locks: one process per work folder, and file systems without locks, where the rename decides."""
+"""Locks: one process per work folder. On file systems without locks the rename decides."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from toy import Bench
 from cleargs.digest import DigestMemo
 from cleargs.errors import StoreError
 from cleargs.manifest import read_manifest
-from cleargs.pipeline.lock import file_lock, is_locked, only_one
+from cleargs.pipeline.lock import exclusive_lock, file_lock, is_locked
 from cleargs.pipeline.store import Store
 
 
@@ -30,25 +30,25 @@ def no_locks(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_lock_excludes_and_ends_with_its_block(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "locks" / "key.lock"
     assert not is_locked(path)
-    with only_one(path, bench.remarks, "key") as alone, file_lock(path, wait=False) as second:
-        assert (alone, second) == (True, False)
+    with exclusive_lock(path, bench.remarks, "key") as locked, file_lock(path, wait=False) as second:
+        assert (locked, second) == (True, False)
         assert is_locked(path) and path.read_text().startswith(f"process {os.getpid()} on ")
     assert not is_locked(path) and bench.remarks.lines == []
     with file_lock(path, shared=True), file_lock(path, shared=True, wait=False) as second:
         assert second and not is_locked(path)
 
 
-def test_a_lock_without_a_name_is_waited_for(bench: Bench, tmp_path: Path) -> None:
+def test_waits_for_a_holder_without_a_name(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "key.lock"
     with ExitStack() as first:
         first.enter_context(file_lock(path))
         path.write_bytes(b"\xff")
         release = threading.Timer(0.2, first.pop_all().close)
         release.start()
-        with only_one(path, bench.remarks, "square") as alone:
-            assert alone
+        with exclusive_lock(path, bench.remarks, "square") as locked:
+            assert locked
         release.join()
-    assert bench.remarks.lines == ["square: another process works on it; waiting"]
+    assert bench.remarks.lines == ["square: another process works on it; waiting for it to end"]
 
 
 @pytest.mark.usefixtures("no_locks")
@@ -65,9 +65,11 @@ def test_without_locks_the_rename_decides(bench: Bench) -> None:
         first, second = Store(bench.root / "shared", memo), Store(bench.root / "shared", memo)
         second._owner_suffix = lambda: "@another-node-1"  # type: ignore[method-assign]
         key, result = manifest.key, (bench.folder / "total" / "total.txt").read_bytes()
-        with first.lock(key, bench.remarks, "total") as alone, second.lock(key, bench.remarks, "total"):
-            assert not alone
-            works = [store.open_work(key, fresh=False, entry=None, alone=False) for store in (first, second)]
+        with first.lock(key, bench.remarks, "total") as locked, second.lock(key, bench.remarks, "total"):
+            assert not locked
+            works = [
+                store.open_work(key, forced=False, entry=None, locked=False) for store in (first, second)
+            ]
             for work in works:
                 (work.out / "total.txt").write_bytes(result)
             assert first.publish(works[0], manifest) == second.publish(works[1], manifest) == manifest
@@ -75,7 +77,7 @@ def test_without_locks_the_rename_decides(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("no_locks")
-def test_without_locks_a_failed_try_is_resumed(bench: Bench) -> None:
+def test_without_locks_a_failed_attempt_is_resumed(bench: Bench) -> None:
     (bench.capture / "3.txt").write_text("no number")
     with pytest.raises(ValueError, match="no number"):
         bench.run()
@@ -88,7 +90,7 @@ def test_without_locks_a_failed_try_is_resumed(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("no_locks")
-def test_without_locks_nothing_is_cleared_away(bench: Bench) -> None:
+def test_without_locks_nothing_is_removed(bench: Bench) -> None:
     bench.run("square.power=3")
     bench.run()
     with DigestMemo(bench.store / "digests.sqlite") as memo:

@@ -1,4 +1,4 @@
-"""A ``run.toml`` of an earlier version is read, whatever became of its settings."""
+"""A ``run.toml`` of an earlier version can be read, including its retired settings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cleargs.pipeline.session import resolve_run
 from cleargs.pipeline.settings import settings_of
 
 OLD = (Path(__file__).with_name("old_run.toml")).read_text()
-"""As version 0.2.0 resolved the recipe smoke: 190 settings, those of a training three times."""
+"""The recipe smoke as written by version 0.2.0: 190 settings, with those of a training in three tables."""
 
 
 OTHER_DEFAULTS = ["ingest.camera_model=SIMPLE_RADIAL"]
@@ -35,7 +35,7 @@ def test_old_settings_are_the_recipe() -> None:
 
 
 def test_old_run_takes_new_settings(tmp_path: Path) -> None:
-    """Its retired names do not contradict what is set now."""
+    """Its retired settings do not contradict the new ones."""
     (tmp_path / "capture").mkdir()
     (tmp_path / RUN_FILE).write_text(OLD)
     overrides = ["g0.quality=high", "g0.lr_means=1e-4"]
@@ -55,7 +55,7 @@ def test_old_run_takes_new_settings(tmp_path: Path) -> None:
     ],
 )
 def test_contradicting_name_is_an_error(change: str, name: str, remedy: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{name} = .* is no setting any more") as caught:
+    with pytest.raises(ConfigError, match=f"^{name} = .* is no longer a setting") as caught:
         check_document(installed(), old(change))
     assert remedy in caught.value.hint
 
@@ -73,7 +73,7 @@ def test_later_trainings_follow_the_first() -> None:
 
 
 def test_settings_are_few() -> None:
-    """Each has to be worth a reader's time; a number that nobody changes is a constant."""
+    """A number that no user changes is a constant."""
     dag = installed()
     count = sum(len(settings_of(name, dag.load(name).CONFIG)) for name in dag.names)
     assert count <= 127

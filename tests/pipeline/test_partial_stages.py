@@ -1,4 +1,4 @@
-"""Stages that are done only in part: published as such, tried again, never taken for whole."""
+"""Stages that are done only in part are published as partial and retried."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from toy import Bench
 from cleargs.manifest import read_manifest
 
 
-def test_partial_stops_is_retried_and_redoes_only_what_is_missing(bench: Bench) -> None:
+def test_partial_stage_stops_the_run_and_is_retried(bench: Bench) -> None:
     (bench.capture / "2.txt").write_text("")
     outcomes = bench.run()
     assert [outcome.stage for outcome in outcomes] == ["count"]
@@ -17,7 +17,7 @@ def test_partial_stops_is_retried_and_redoes_only_what_is_missing(bench: Bench) 
     bench.work_done()
 
     bench.run()
-    assert bench.work_done() == ["count"], "what was there is carried over"
+    assert bench.work_done() == ["count"], "finished files are kept"
     assert not (bench.folder / "square").exists()
 
 
@@ -32,7 +32,7 @@ def test_status_is_inherited_with_allow_partial(bench: Bench) -> None:
     assert bench.work_done() == ["count"], "only the stage with something missing is tried again"
 
 
-def test_whole_upstream_with_equal_content_clears_the_inherited_status(bench: Bench) -> None:
+def test_complete_upstream_clears_the_inherited_status(bench: Bench) -> None:
     gone = bench.capture / "6.txt"
     gone.write_text("")
     assert bench.run(allow_partial=True)[-1].manifest.status == "partial"
@@ -44,8 +44,8 @@ def test_whole_upstream_with_equal_content_clears_the_inherited_status(bench: Be
     assert read_manifest(bench.folder / "square").status == "complete"
 
 
-def test_cured_partial_becomes_whole(bench: Bench) -> None:
-    """The stage reads something outside its key (a device that failed, say) and succeeds later."""
+def test_partial_stage_becomes_complete(bench: Bench) -> None:
+    """The stage fails for a reason outside its key, for example a broken device, and succeeds later."""
     stage = bench.dag.load("count")
     run = stage.run
     from cleargs.pipeline.stage import StageResult

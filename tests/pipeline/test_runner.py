@@ -1,4 +1,4 @@
-"""What is done again, and what is not."""
+"""The runner runs the stages that need it, and no others."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def test_second_run_does_nothing_and_leaves_files_alone(bench: Bench) -> None:
     assert (bench.folder / "run.toml").stat().st_mtime_ns == run_file
 
 
-def test_a_setting_concerns_its_stage_and_those_after_it_only(bench: Bench) -> None:
+def test_a_setting_affects_its_stage_and_later_ones(bench: Bench) -> None:
     bench.run()
     bench.work_done()
     bench.run("square.power=3")
     assert stages_run(bench) == ["square", "total"]
     bench.run()
-    assert stages_run(bench) == [], "going back to old settings is a hit"
+    assert stages_run(bench) == [], "the results of the old settings are still in the store"
     assert (bench.folder / "total" / "total.txt").read_text() == "plain 55.0 0"
 
 
@@ -74,7 +74,7 @@ def test_threads_and_settings_outside_the_key_keep_the_hit(bench: Bench) -> None
     assert bench.work_done() == []
 
 
-def test_seed_concerns_every_stage(bench: Bench) -> None:
+def test_seed_affects_every_stage(bench: Bench) -> None:
     bench.run()
     bench.work_done()
     bench.run(seed=1)
@@ -102,7 +102,7 @@ def test_external_file_counts_by_content_not_by_path(bench: Bench) -> None:
     assert bench.work_done() == []
     moved.write_bytes(b"others!")
     bench.run(f"count.weights={moved}")
-    assert stages_run(bench) == ["count"], "the stages after it read equal content"
+    assert stages_run(bench) == ["count"], "later stages read equal content"
 
 
 def test_moved_workspace_is_a_hit(bench: Bench) -> None:
@@ -145,7 +145,7 @@ def test_until_and_force(bench: Bench) -> None:
     bench.run()
     bench.work_done()
     outcomes = bench.run(force=["square"])
-    assert stages_run(bench) == ["square"], "equal results: nothing after it is done again"
+    assert stages_run(bench) == ["square"], "equal results: no later stage runs"
     assert [outcome.how for outcome in outcomes] == ["found", "made", "found"]
     assert any("same digests" in line for line in bench.remarks.lines)
     with pytest.raises(InputError, match="no stage 'sqare'") as error:
@@ -153,8 +153,8 @@ def test_until_and_force(bench: Bench) -> None:
     assert error.value.hint == "did you mean square?"
 
 
-def test_a_stage_that_is_forced_tells_how_long_it_took_this_time(bench: Bench) -> None:
-    """An equal result stays as it was, times and all: they were told for today's."""
+def test_a_forced_stage_reports_the_time_of_this_attempt(bench: Bench) -> None:
+    """An equal result keeps its manifest, with the times of the first attempt."""
     square = bench.run()[1]
     write_manifest(square.folder, square.manifest.model_copy(update={"seconds": 1000.0}))
     again = bench.run(force=["square"])[1]
@@ -163,10 +163,10 @@ def test_a_stage_that_is_forced_tells_how_long_it_took_this_time(bench: Bench) -
     assert again.manifest.seconds < 500.0
 
 
-def test_killed_while_it_tidies_up_a_stage_leaves_no_half_of_its_checkpoints(
+def test_killed_during_cleanup_leaves_no_partial_checkpoints(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its result was gone later, and the half that was left of the work could not be gone on with."""
+    """Once, a later attempt could not resume from half of the checkpoints after the result was removed."""
 
     def killed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -178,12 +178,12 @@ def test_killed_while_it_tidies_up_a_stage_leaves_no_half_of_its_checkpoints(
     assert [path.name for path in work.iterdir() if not path.name.startswith(".rubbish")] == []
 
 
-def test_a_limit_that_keeps_the_libraries_out_is_told_before_any_work(
+def test_too_little_address_space_is_refused_before_any_work(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Under ``ulimit -v 700000`` OpenBLAS asked for memory for ever."""
+    """Under ``ulimit -v 700000``, OpenBLAS requested memory in an endless loop."""
     monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (716_800_000, -1))
-    with pytest.raises(InputError, match="717 MB of addresses"):
+    with pytest.raises(InputError, match="virtual memory is 717 MB"):
         bench.run()
     assert stages_run(bench) == []
 
@@ -205,7 +205,7 @@ def test_status_names_what_changed(bench: Bench) -> None:
     assert bench.plan()["square"].reasons == ("input count/numbers: 2.txt changed, 9.txt added",)
     shutil.rmtree((bench.folder / "count").resolve())
     (bench.folder / ".count.before").unlink(missing_ok=True)
-    assert bench.plan()["count"].reasons == ("not made yet",)
+    assert bench.plan()["count"].reasons == ("no results yet",)
 
 
 def test_planning_writes_nothing(bench: Bench) -> None:
@@ -258,7 +258,7 @@ def test_full_disk_is_noticed_before_work(bench: Bench) -> None:
 
 @dataclass
 class Machine:
-    """Where all takes twice as long, once that is measured."""
+    """A machine that takes twice as long, which is known once it is measured."""
 
     measured: int = 0
 
@@ -272,20 +272,20 @@ class Machine:
 
 
 def expected(bench: Bench) -> list[str]:
-    return [line.partition(":")[0] for line in bench.remarks.lines if "expected about" in line]
+    return [line.partition(" (")[0] for line in bench.remarks.lines if "estimate: " in line]
 
 
-def test_long_work_is_told_at_the_pace_of_this_machine(bench: Bench) -> None:
+def test_long_work_is_estimated_at_the_measured_pace(bench: Bench) -> None:
     machine = Machine()
     machine.under(bench).run("count.limit=3")
     assert machine.measured == 1
-    assert expected(bench) == ["expected about 12.8 min", "now expected about 6.6 min"]
+    assert expected(bench) == ["estimate: about 12.8 min", "new estimate: about 6.6 min"]
     known = machine.under(bench).plan("square.power=3", "count.mode=padded")
     costs = [plan.estimate.minutes for plan in known.values() if plan.estimate is not None]
-    assert costs == pytest.approx([0.2, 12.0, 0.6]), "also where it is only remembered"
+    assert costs == pytest.approx([0.2, 12.0, 0.6]), "planning uses the known pace"
 
 
-def test_short_work_and_that_of_a_gpu_is_not_worth_a_measurement(bench: Bench) -> None:
+def test_pace_is_not_measured_for_short_or_gpu_work(bench: Bench) -> None:
     machine = Machine()
     slow = machine.under(bench)
     slow.run(until="count")
@@ -322,7 +322,7 @@ def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_pat
 def test_run_inside_its_input_is_refused(bench: Bench) -> None:
     inside = replace(bench.settings(), folder=bench.capture / "run")
     store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
-    with pytest.raises(InputError, match="lies inside the input"):
+    with pytest.raises(InputError, match="is inside the input"):
         Planner(bench.dag, inside, store, 1, bench.remarks).plan()
     at_it = replace(bench.settings(), folder=bench.capture, source=bench.capture)
     with pytest.raises(InputError, match="is the input itself"):

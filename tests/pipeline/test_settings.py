@@ -53,7 +53,7 @@ def test_override_values_are_toml_bare_words_strings(text: str, document: dict[s
 
 @pytest.mark.parametrize("text", ["a.b", "=3", "a..b=1"])
 def test_malformed_override(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"not of the form a\.b=value"):
+    with pytest.raises(ConfigError, match=r"does not have the form a\.b=value"):
         parse_override(text)
 
 
@@ -81,10 +81,10 @@ def test_merge_keeps_what_is_not_named() -> None:
         ("count.mode=pad", "count.mode = 'pad' cannot be used", "allowed: plain or padded"),
         (
             "count=3",
-            "count = 3 cannot be used",
-            "count is a table of settings: name one of them, count.limit",
+            "count = 3 cannot be used: count is a table of settings",
+            "set one of them, for example count.limit",
         ),
-        ("count.inner=3", "count.inner = 3 cannot be used", "name one of them, count.inner.depth"),
+        ("count.inner=3", "count.inner = 3 cannot be used", "set one of them, for example count.inner.depth"),
         ("seed=-1", "seed = -1 cannot be used", "a whole number from 0"),
         ("seed=true", "seed = True cannot be used", "a whole number from 0"),
     ],
@@ -103,7 +103,7 @@ def test_errors_teach(dag: Dag, text: str, cause: str, hint: str) -> None:
         ("rivr.steps=30", "did you mean rivr.distil.steps?"),
         ("g0.expert=embedded", "did you mean rivr.expert?"),
         ("sed=3", "did you mean seed?"),
-        ("g0.threads=3", "that is an option: --threads"),
+        ("g0.threads=3", "use the option --threads"),
     ],
 )
 def test_a_name_from_elsewhere_is_found(text: str, hint: str) -> None:
@@ -118,7 +118,7 @@ def test_every_setting_has_a_meaning_and_a_range() -> None:
             assert setting.meaning and setting.allowed, setting.name
 
 
-def test_run_file_tells_what_each_setting_means(bench: Bench) -> None:
+def test_run_file_has_the_meaning_of_each_setting(bench: Bench) -> None:
     document = check_document(installed(), {"ingest": {"holdout": "every:8"}})
     write_run_file(RunSpec(bench.folder, bench.capture, document, bench.store, "cpu"))
     text = (bench.folder / "run.toml").read_text()
@@ -143,7 +143,7 @@ def test_recipe_file_then_overrides_then_seed(dag: Dag, tmp_path: Path) -> None:
 
 
 def test_bad_recipes(dag: Dag, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no workflow 'defalt'") as error:
+    with pytest.raises(ConfigError, match="no recipe 'defalt'") as error:
         read_recipe("defalt")
     assert error.value.hint == "did you mean default?"
     with pytest.raises(ConfigError, match="cannot read"):
@@ -192,7 +192,7 @@ def test_marked_settings_stay_out_of_the_key(dag: Dag) -> None:
         ('input = "x"\nseed = ' + "9" * 5000 + "\n", "not valid TOML"),
     ],
 )
-def test_run_files_that_nobody_wrote(bench: Bench, text: str, words: str) -> None:
+def test_malformed_run_files(bench: Bench, text: str, words: str) -> None:
     bench.folder.mkdir()
     (bench.folder / "run.toml").write_text(text)
     with pytest.raises(InputError, match=words) as caught:
@@ -201,7 +201,7 @@ def test_run_files_that_nobody_wrote(bench: Bench, text: str, words: str) -> Non
 
 
 def test_a_damaged_device_hides_neither_input_nor_store(bench: Bench) -> None:
-    """``--workflow`` forgets settings only: the run stays one of its capture, with its store."""
+    """``--workflow`` replaces the settings only: the run keeps its capture and its store."""
     bench.folder.mkdir()
     shared, recipe = bench.root / "shared", bench.root / "empty.toml"
     recipe.touch()
@@ -217,14 +217,14 @@ def test_a_damaged_device_hides_neither_input_nor_store(bench: Bench) -> None:
 def test_a_pipe_for_a_run_file(bench: Bench) -> None:
     bench.folder.mkdir()
     os.mkfifo(bench.folder / "run.toml")
-    with pytest.raises(InputError, match="no run"):
+    with pytest.raises(InputError, match="not a run"):
         read_run_file(bench.folder, bench.dag)
-    with pytest.raises(ConfigError, match="no regular file"):
+    with pytest.raises(ConfigError, match="not a regular file"):
         read_toml(bench.folder / "run.toml")
 
 
-def test_disk_is_told_in_the_unit_that_says_something(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_disk_space_is_reported_in_megabytes(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = shutil.disk_usage(bench.root)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=12_000))
-    with pytest.raises(StoreError, match=r"needs about 3 MB of disk, 0 MB are free"):
+    with pytest.raises(StoreError, match=r"needs about 3 MB of disk, and .* has 0 MB free"):
         bench.run()

@@ -1,4 +1,4 @@
-"""What a run folder shows: never results of other settings or inputs than its own."""
+"""A run folder never shows results of other settings or inputs than its own."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def shown(bench: Bench) -> list[str]:
 
 
 def reasons(bench: Bench) -> dict[str, tuple[str, ...]]:
-    """What `cleargs status` says of each stage that is not done."""
+    """Return the reasons that `cleargs status` gives for each stage that is not done."""
     run = read_run_file(bench.folder, bench.dag)
     with DigestMemo(run.store / "digests.sqlite") as memo:
         planner = Runner(bench.dag, run, Store(run.store, memo), 1, bench.remarks).planner
@@ -36,7 +36,7 @@ def test_changed_setting_hides_what_it_affects(bench: Bench) -> None:
     assert reasons(bench) == {"square": ("setting square.power: 2 -> 3",), "total": ("waits for square",)}
     bench.work_done()
     bench.run()
-    assert shown(bench) == list(bench.dag.names) and bench.work_done() == [], "going back is a hit"
+    assert shown(bench) == list(bench.dag.names) and bench.work_done() == [], "old results are kept"
     assert reasons(bench) == {} and not list(bench.folder.glob(".*.before"))
 
 
@@ -45,7 +45,7 @@ def test_changed_input_and_seed_hide_everything_first(bench: Bench) -> None:
     (bench.capture / "1.txt").write_text("no number")
     with pytest.raises(ValueError, match="no number"):
         bench.run()
-    assert shown(bench) == ["count"], "it was made from the new input"
+    assert shown(bench) == ["count"], "count succeeded with the new input"
     (bench.capture / "1.txt").write_text("1")
     bench.run()
     bench.run(seed=4, until="count")
@@ -78,7 +78,7 @@ def test_newer_program_hides_nothing(bench: Bench, monkeypatch: pytest.MonkeyPat
     bench.run()
     monkeypatch.setattr(bench.dag.load("square"), "VERSION", 2)
     monkeypatch.setattr(bench.dag.load("square"), "LIBRARIES", ("click",))
-    assert bench.plan()["square"].state == "missing", "a run would make it again"
+    assert bench.plan()["square"].state == "missing", "a run would run it again"
     bench.run(until="count")
     assert shown(bench) == list(bench.dag.names)
 
@@ -114,7 +114,7 @@ def test_results_without_manifest_are_hidden(bench: Bench) -> None:
     assert shown(bench) == list(bench.dag.names)
 
 
-def test_what_a_run_showed_before_may_be_cleared_away(bench: Bench) -> None:
+def test_earlier_results_of_a_run_may_be_removed(bench: Bench) -> None:
     bench.run()
     before = read_manifest(bench.folder / "square").key
     bench.run("square.power=3")

@@ -1,4 +1,4 @@
-"""The store: damage is never a hit, publishing is all or nothing, clearing keeps what runs show."""
+"""The store never uses damaged results, publishes atomically, and keeps the results that runs link to."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cleargs.pipeline.store import Store
 
 
 def flip(file: Path) -> None:
-    """Other content of the same size."""
+    """Change the content but not the size."""
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
     file.write_bytes(bytes(data))
@@ -86,7 +86,7 @@ def test_damage_is_a_miss_with_a_warning(bench: Bench, what: str) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"no database", b"SQLite format 3\x00" + b"\x07" * 4096])
-def test_damaged_memo_troubles_nobody(bench: Bench, content: bytes) -> None:
+def test_damaged_memo_is_replaced(bench: Bench, content: bytes) -> None:
     bench.run()
     (bench.store / "digests.sqlite").write_bytes(content)
     assert [outcome.how for outcome in bench.run()] == ["found"] * 3
@@ -99,7 +99,7 @@ def test_damaged_memo_troubles_nobody(bench: Bench, content: bytes) -> None:
             assert memo.digest(file) == known, "it works again"
 
 
-def test_wrong_memo_does_not_condemn_a_healthy_file(tmp_path: Path, bench: Bench) -> None:
+def test_wrong_digest_in_the_memo_is_checked(tmp_path: Path, bench: Bench) -> None:
     bench.run()
     folder = (bench.folder / "count").resolve()
     with DigestMemo(tmp_path / "memo.sqlite") as memo:
@@ -108,7 +108,7 @@ def test_wrong_memo_does_not_condemn_a_healthy_file(tmp_path: Path, bench: Bench
         assert not list(damages(folder, manifest, manifest.files, memo))
 
 
-def test_memo_is_believed_only_while_the_file_is_the_same(tmp_path: Path) -> None:
+def test_memo_is_used_only_for_the_same_file(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"one")
     with DigestMemo(tmp_path / "memo.sqlite") as memo:
@@ -133,7 +133,7 @@ def test_two_processes_may_use_the_memo_at_once(tmp_path: Path) -> None:
         assert {memo.digest(file) for file in files} == {"one"}
 
 
-def test_what_was_forgotten_stays_forgotten(tmp_path: Path) -> None:
+def test_a_forgotten_digest_stays_forgotten(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"one")
     with DigestMemo(tmp_path / "memo.sqlite") as memo:
@@ -191,7 +191,7 @@ def test_collect_keeps_what_runs_show(bench: Bench) -> None:
         ]
         with (
             file_lock(bench.store / "locks" / "store.lock", shared=True),
-            pytest.raises(StoreError, match="at work"),
+            pytest.raises(StoreError, match="a run is using"),
         ):
             store.collect(bench.dag.names, checkpoints=False, dry_run=False)
     assert [outcome.how for outcome in bench.run()] == ["found"] * 3
@@ -199,14 +199,14 @@ def test_collect_keeps_what_runs_show(bench: Bench) -> None:
 
 
 def damage_unseen(file: Path) -> None:
-    """One byte changes as on a disk that rots: size and all times stay, as far as the memo can tell."""
+    """Change one byte and restore the time stamps that a program can set."""
     before = file.stat()
     flip(file)
     os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
-def test_a_byte_changed_behind_an_old_time_stamp_is_no_hit(bench: Bench) -> None:
-    """`cp -p` and archivers put mtime back; the kernel's own time of the last change stays."""
+def test_damage_behind_an_old_mtime_is_noticed(bench: Bench) -> None:
+    """``cp -p`` and archivers restore mtime. They cannot restore ctime."""
     bench.run()
     bench.run()  # all digests are remembered now
     damage_unseen(bench.folder / "count" / "log.txt")
@@ -214,7 +214,7 @@ def test_a_byte_changed_behind_an_old_time_stamp_is_no_hit(bench: Bench) -> None
     assert "damaged" in bench.remarks.warnings[0]
 
 
-def test_an_input_changed_behind_an_old_time_stamp_is_no_hit(bench: Bench) -> None:
+def test_changed_input_behind_an_old_mtime_is_noticed(bench: Bench) -> None:
     for file in bench.capture.iterdir():
         os.utime(file, (1e9, 1e9))
     time.sleep(RACY_NS / 1e9 + 0.1)
@@ -224,7 +224,7 @@ def test_an_input_changed_behind_an_old_time_stamp_is_no_hit(bench: Bench) -> No
 
 
 def rot(bench: Bench, file: Path) -> None:
-    """A byte changes with no trace in any time stamp, as a disk does it: the memo still knows the old one."""
+    """Change one byte without a trace in any time stamp, as a failing disk does. The memo is not updated."""
     known = file_digest(file)
     flip(file)
     with DigestMemo(bench.store / "digests.sqlite") as memo:
@@ -242,7 +242,7 @@ def test_a_stage_that_runs_reads_its_inputs_again(bench: Bench) -> None:
     assert made.origins["capture"]["3.txt"] == file_digest(bench.capture / "3.txt")
 
 
-def test_a_stage_that_runs_finds_a_rotten_result_upstream(bench: Bench) -> None:
+def test_a_stage_that_runs_finds_damage_upstream(bench: Bench) -> None:
     bench.run()
     rot(bench, (bench.folder / "count" / "numbers" / "3.txt").resolve())
     with pytest.raises(StoreError, match=r"count: .*damaged \(numbers/3\.txt has other content\)"):
@@ -250,7 +250,7 @@ def test_a_stage_that_runs_finds_a_rotten_result_upstream(bench: Bench) -> None:
     assert bench.run("square.power=3")[0].how == "made"
 
 
-def test_an_input_that_changes_while_it_is_read_is_not_published(bench: Bench) -> None:
+def test_an_input_that_changes_during_a_stage_is_an_error(bench: Bench) -> None:
     stage = bench.dag.load("count")
     run = stage.run
 
@@ -270,7 +270,7 @@ def test_an_input_that_changes_while_it_is_read_is_not_published(bench: Bench) -
 def test_collecting_between_plan_and_work_costs_nothing(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`gc` beside a run: what was found while planning is gone when the run holds the store."""
+    """`gc` removes results between the plan and the work of a run."""
     bench.run("square.power=3")
     bench.run()
     in_use = Store.in_use
@@ -299,7 +299,7 @@ def test_links_among_leftovers_are_not_published(bench: Bench) -> None:
     assert bench.digests() == healthy
 
 
-def test_somebody_elses_store_can_be_read(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_only_store_can_be_read(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     shared = bench.root / "shared"
     bench.run(store=shared)
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK or Path(path) != shared)
@@ -307,12 +307,12 @@ def test_somebody_elses_store_can_be_read(bench: Bench, monkeypatch: pytest.Monk
     (bench.folder / "total").unlink()
     assert [outcome.how for outcome in bench.run(store=shared)] == ["found"] * 3
     assert (bench.folder / "total" / "total.txt").exists() and sorted(shared.rglob("*")) == before
-    with pytest.raises(StoreError, match="may only be read"):
+    with pytest.raises(StoreError, match="is read-only"):
         bench.run("square.power=3", store=shared)
 
 
 def test_foreign_files_among_leftovers_are_not_published(bench: Bench) -> None:
-    """Only what a stage says that it resumes from is left of a killed try."""
+    """Only files in LEFTOVERS stay from a killed attempt."""
     healthy = bench.digests()
     manifests = {name: read_manifest(bench.folder / name) for name in ("count", "square")}
     for name, places in {

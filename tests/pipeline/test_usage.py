@@ -1,4 +1,4 @@
-"""What a stage used is counted from where it starts, children included."""
+"""The usage of a stage counts from its start and includes child processes."""
 
 from __future__ import annotations
 
@@ -32,6 +32,6 @@ assert usage.peak_memory_gb - before > 0.15
 """
 
 
-def test_memory_that_is_held_counts() -> None:
-    """In a process of its own: in this one, garbage of other tests may be given back meanwhile."""
+def test_allocated_memory_counts() -> None:
+    """Use a separate process: in this one, memory of other tests may be freed in the meantime."""
     subprocess.run([sys.executable, "-c", HELD], check=True)

@@ -1,7 +1,7 @@
-"""A pipeline of toy stages: count numbers, square them, add them up. Also a program that can be killed.
+"""A pipeline of toy stages: count numbers, square them, add them up. It is also a program to kill in tests.
 
-``python toy.py JOURNAL ARGUMENTS...`` is ``cleargs ARGUMENTS...`` with these stages. JOURNAL gets one line
-for each piece of work that is really done.
+``python toy.py JOURNAL ARGUMENTS...`` is ``cleargs ARGUMENTS...`` with these stages. They append a line to
+the file JOURNAL for each piece of work that they do.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Inner(BaseModel):
 class CountConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    limit: int = Field(100, ge=1, le=1000, description="at most so many numbers")
+    limit: int = Field(100, ge=1, le=1000, description="maximum count of numbers")
     mode: Literal["plain", "padded"] = "plain"
     weights: str = Field("", description="a file", json_schema_extra={"key": False})
     inner: Inner = Inner(depth=3)
@@ -82,7 +82,7 @@ class Count:
     def run(self, context: StageContext[Any]) -> StageResult:
         note(self.journal, "count")
         if not context.source.is_dir():
-            raise StageError("the capture is no folder", hint="give a folder")
+            raise StageError("the capture is not a folder", hint="give a folder")
         files = sorted(context.source.glob("*.txt"))[: context.config.limit]
         (context.out / "numbers").mkdir(exist_ok=True)
         missing = []
@@ -100,10 +100,10 @@ class Count:
 
 @dataclass
 class Square:
-    """numbers -> powers/*.txt, one at a time, so that a killed try resumes.
+    """numbers -> powers/*.txt, one at a time, so that a killed attempt resumes.
 
-    Notes ``held`` behind the first number, and waits there while the file ``hold`` exists: a test has all the
-    time it needs to meet this stage at work.
+    After the first number, the stage notes ``held`` and waits while the file ``hold`` exists. During this
+    time a test can examine the running stage.
     """
 
     journal: Path
@@ -121,7 +121,7 @@ class Square:
     def preflight(self, config: Any) -> None: ...
 
     def estimate(self, context: StageContext[Any]) -> Estimate:
-        """A minute a number; none is counted twice once the numbers are there."""
+        """One minute per number; the number of them is estimated until ``count`` is done."""
         folder = context.inputs.get("count")
         numbers = context.expected["count"].frames if folder is None else len(list(folder.glob("numbers/*")))
         return Estimate(minutes=float(numbers), memory_gb=0.1, disk_gb=0.001)
@@ -199,7 +199,7 @@ def toy_dag(journal: Path) -> Dag:
 
 
 class Remarks(SilentReporter):
-    """A reporter that keeps what it is told."""
+    """A reporter that keeps all messages."""
 
     def __init__(self) -> None:
         self.warnings: list[str] = []
@@ -214,7 +214,7 @@ class Remarks(SilentReporter):
 
 @dataclass
 class Bench:
-    """Everything of one toy run; each call opens the store anew, as a new process would."""
+    """A toy run. Each call opens the store again, as a new process would."""
 
     root: Path
     dag: Dag
@@ -237,7 +237,7 @@ class Bench:
         return self.root / "journal"
 
     def work_done(self) -> list[str]:
-        """What stages noted since the last call."""
+        """Return the lines that stages noted since the last call."""
         lines = self.journal.read_text().splitlines() if self.journal.exists() else []
         self.journal.unlink(missing_ok=True)
         return lines
@@ -271,12 +271,12 @@ class Bench:
             return {plan.stage: plan for plan in planner.plan()}
 
     def digests(self) -> dict[str, str]:
-        """Stage -> digest of its published tree, as another process would find it."""
+        """Return stage -> digest of its published tree, as found by another process."""
         return {outcome.stage: outcome.manifest.digest for outcome in self.run()}
 
 
 def make_bench(root: Path) -> Bench:
-    """A capture of six numbers and nothing else yet."""
+    """Make a capture of six numbers, without a run."""
     capture = root / "capture"
     capture.mkdir()
     for number in range(6):

@@ -1,4 +1,4 @@
-"""The small run that is rendered."""
+"""A small run for the tests of renders."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ from eval_world import cameras, make_scene, write_run
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six frames of 96x72, the scene of g0; nothing in it is changed."""
+    """A run with six frames of 96x72 px and the scene of g0. Tests do not change it."""
     return write_run(tmp_path_factory.mktemp("render") / "run", make_scene(), cameras())

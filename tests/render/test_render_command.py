@@ -1,4 +1,4 @@
-"""``cleargs render``: what is written, read back, and what is refused."""
+"""``cleargs render``: stills, films, poses of a file, and errors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def exr(path: Path) -> dict[str, NDArray[np.float32]]:
     source = OpenImageIO.ImageInput.open(str(path))
     pixels, names = source.read_image(OpenImageIO.FLOAT), source.spec().channelnames
     source.close()
-    return {name: pixels[..., place] for place, name in enumerate(names)}
+    return {name: pixels[..., index] for index, name in enumerate(names)}
 
 
 def refusal(captured: pytest.CaptureFixture[str]) -> tuple[str, str]:
@@ -50,7 +50,7 @@ def refusal(captured: pytest.CaptureFixture[str]) -> tuple[str, str]:
 def test_a_still_is_what_the_scene_shows_at_the_frame(run: Path, tmp_path: Path) -> None:
     assert render(run, tmp_path / "new" / "still.png", "--frame", "4") == 0
     expected = picture(make_scene(), cameras()[4])
-    # The quaternions of the table are those of the pose but for rounding.
+    # The quaternions of the table are those of the pose, except for rounding.
     difference = np.abs(read_rgb(tmp_path / "new" / "still.png").astype(int) - expected)
     assert 20 < expected.mean() < 235 and difference.max() <= 1
     assert [file.name for file in (tmp_path / "new").iterdir()] == ["still.png"]
@@ -62,13 +62,13 @@ def test_without_a_frame_the_still_is_of_the_middle(run: Path, tmp_path: Path) -
 
 
 def test_a_still_of_another_size(run: Path, tmp_path: Path) -> None:
-    """Twice the height, three times the width: the middle is the frame's, twice as large."""
+    """With twice the height and three times the width, the middle shows the frame at twice its size."""
     assert render(run, tmp_path / "wide.png", "--frame", "2", "--size", f"{3 * WIDTH}x{2 * HEIGHT}") == 0
     wide = read_rgb(tmp_path / "wide.png")
     assert wide.shape == (2 * HEIGHT, 3 * WIDTH, 3)
     middle = wide[:, WIDTH // 2 : -WIDTH // 2].reshape(HEIGHT, 2, WIDTH, 2, 3).mean(axis=(1, 3))
-    # Splats are widened by a third of a pixel, so that the larger picture is a little sharper: 0.3 levels;
-    # the views of other frames are 29 and more away.
+    # Splats are dilated by a third of a pixel, so the larger image is a little sharper: it differs by 0.3
+    # levels. The views of other frames differ by 29 or more.
     assert np.abs(middle - picture(make_scene(), cameras()[2])).mean() < 1
 
 
@@ -96,14 +96,14 @@ def test_an_exr_holds_light_alpha_and_depth(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1"])
-def test_a_film_has_the_length_the_pace_and_the_size(run: Path, tmp_path: Path, codec: str) -> None:
+def test_a_film_has_its_length_frame_rate_and_size(run: Path, tmp_path: Path, codec: str) -> None:
     wanted = ["--fps", "12", "--seconds", "1.5", "--codec", codec, "--size", "128x96"]
     assert render(run, tmp_path / "film.mp4", *wanted) == 0
     timeline, pictures = read_timeline(tmp_path / "film.mp4"), film(tmp_path / "film.mp4")
     assert len(pictures) == 18 and pictures[0].shape == (96, 128, 3)
     assert timeline.seconds(17) == pytest.approx(17 / 12)
-    # It begins at the first pose and ends at the last. The codec takes up to 1.7 levels; the next frame's
-    # view is 25 away, the next picture of the film 10.
+    # It begins at the first pose and ends at the last. The codec changes up to 1.7 levels. The next frame of
+    # the capture differs by 25, the next frame of the film by 10.
     for shown, number in ((pictures[0], 0), (pictures[-1], 5)):
         assert render(run, tmp_path / f"{number}.png", "--frame", str(number), "--size", "128x96") == 0
         assert np.abs(shown.astype(float) - read_rgb(tmp_path / f"{number}.png")).mean() < 4
@@ -117,9 +117,9 @@ def test_side_by_side_has_the_nearest_frame_on_the_left(run: Path, tmp_path: Pat
     raw = [read_rgb(run / f"ingest/images/{number:06d}.png").astype(float) for number in range(6)]
     differences = np.array([[np.abs(each[:, :WIDTH] - image).mean() for image in raw] for each in pictures])
     left = differences.argmin(axis=1)
-    assert differences.min(axis=1).max() < 4  # 2.3 for the codec; other frames are 24 away
+    assert differences.min(axis=1).max() < 4  # 2.3 from the codec; other frames differ by 24
     assert left[0] == 0 and left[-1] == 5 and (np.diff(left) >= 0).all() and set(left) == set(range(6))
-    # Where the camera stands at that frame the scene shows the same.
+    # The render at the pose of this frame shows the same.
     assert np.abs(pictures[0][:, WIDTH:] - raw[0]).mean() < 4
 
 
@@ -133,23 +133,23 @@ def test_side_by_side_of_a_still_is_not_stretched(run: Path, tmp_path: Path) -> 
 
 
 def test_a_turntable_comes_back(run: Path, tmp_path: Path) -> None:
-    """This capture saw its scene from one side: to and fro, and from the last picture on to the first."""
+    """The capture saw its scene from one side, so the path goes back and forth, and can loop."""
     assert render(run, tmp_path / "turn" / "%02d.png", "--turntable", "--fps", "10", "--seconds", "2") == 0
     files = sorted((tmp_path / "turn").glob("*.png"))
     assert [file.name for file in files] == [f"{number:02d}.png" for number in range(20)]
-    places = np.array(
+    positions = np.array(
         [entry["position"] for entry in json.loads((tmp_path / "turn/cameras.json").read_text())]
     )
-    steps = np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1)
-    # A swing: no step is longer than the longest of a sine of 20 places, and the ends are passed slowly.
-    assert steps.max() < 1.1 * np.pi / 20 * np.linalg.norm(np.ptp(places, axis=0))
+    steps = np.linalg.norm(positions - np.roll(positions, 1, axis=0), axis=1)
+    # No step is longer than the longest step of a sine with 20 samples, and the path is slow at its ends.
+    assert steps.max() < 1.1 * np.pi / 20 * np.linalg.norm(np.ptp(positions, axis=0))
     assert steps.min() < 0.5 * steps.max() and steps[0] <= steps.max()
 
 
 # -- poses of a file ---------------------------------------------------------------------------------------
 
 
-def test_poses_that_were_written_give_the_same_pictures(run: Path, tmp_path: Path) -> None:
+def test_poses_that_were_written_give_the_same_images(run: Path, tmp_path: Path) -> None:
     views = [cameras()[4], cameras()[1]]
     named = [(f"{number}", view) for number, view in enumerate(views)]
     (tmp_path / "cameras.json").write_text(json.dumps(cameras_json(named)))
@@ -165,10 +165,10 @@ def test_poses_that_were_written_give_the_same_pictures(run: Path, tmp_path: Pat
         assert render(run, tmp_path / f"out{number}" / "%d.png", "--poses", str(tmp_path / name), *more) == 0
         for index, view in enumerate(views):
             made = read_rgb(tmp_path / f"out{number}" / f"{index}.png").astype(int)
-            assert np.abs(made - picture(make_scene(), view)).max() <= 2  # the way there and back, rounded
+            assert np.abs(made - picture(make_scene(), view)).max() <= 2  # rounding
 
 
-def test_the_lens_of_a_file_comes_before_that_of_the_capture(tmp_path: Path) -> None:
+def test_the_lens_of_a_file_replaces_that_of_the_capture(tmp_path: Path) -> None:
     lens, pose = cameras()[0], np.eye(4).tolist()
     document: dict[str, Any] = {"w": 200, "h": 100, "camera_angle_x": np.pi / 2, "frames": [
         {"transform_matrix": pose}, {"transform_matrix": pose, "fl_x": 70.0, "cx": 90.0},
@@ -194,10 +194,10 @@ def test_a_file_without_poses_is_refused(tmp_path: Path, document: str) -> None:
         read_poses(tmp_path / "poses.json", cameras()[0], WORLD)
 
 
-# -- refusals ----------------------------------------------------------------------------------------------
+# -- errors ------------------------------------------------------------------------------------------------
 
 
-def test_the_ending_says_what_is_written() -> None:
+def test_the_ending_selects_the_kind_of_output() -> None:
     kinds = {
         "a.mp4": "film",
         "a.PNG": "still",
@@ -207,7 +207,7 @@ def test_the_ending_says_what_is_written() -> None:
     }
     assert {name: kind_of(Path(name)) for name in kinds} == kinds
     for name in ("a", "a.mov", "a.jpg", "a/%d%d.png", "%03d.mp4"):
-        with pytest.raises(InputError, match="no ending that says what to write"):
+        with pytest.raises(InputError, match="no ending of a film or a still"):
             kind_of(Path(name))
 
 
@@ -217,7 +217,7 @@ def test_the_ending_says_what_is_written() -> None:
         ("a.mp4", ["--frame", "1"], "--frame is a still"),
         ("a.png", ["--frame", "99"], "frame 99 is not in this capture"),
         ("a.png", ["--frame", "1", "--turntable"], "give one of them"),
-        ("a.png", ["--turntable"], "pictures do not fit into a.png"),
+        ("a.png", ["--turntable"], "a.png can store only one image, not "),
         ("new/a.mp4", ["--size", "95x54"], "even width"),
         ("a.mp4", ["--size", "wide"], "WIDTHxHEIGHT"),
         ("a.mp4", ["--turntable", "--side-by-side"], "follow the path"),
@@ -225,17 +225,17 @@ def test_the_ending_says_what_is_written() -> None:
         ("a.mp4", ["--world", "input"], "--poses"),
         ("a.png", ["--frame", "1", "--seconds", "3"], "length of the path"),
         ("a.png", ["--stage", "rva"], "rva has no scene"),
-        ("a.gif", [], "no ending that says"),
+        ("a.gif", [], "no ending of a film"),
     ],
 )
-def test_what_cannot_be_is_refused_with_a_remedy(
+def test_wrong_options_are_errors_with_a_hint(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, options: list[str], words: str
 ) -> None:
     assert render(run, tmp_path / name, *options) == 2
     assert words in " ".join(refusal(capsys)) and not list(tmp_path.iterdir())
 
 
-def test_what_is_there_stays(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_files_stay(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.png").write_text("mine")
     (tmp_path / "shots").mkdir()
     for output in (tmp_path / "mine.png", tmp_path / "shots" / "%02d.png"):
@@ -247,22 +247,22 @@ def test_what_is_there_stays(run: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert render(run, tmp_path / "shots" / "%02d.png", "--force", "--fps", "2", "--seconds", "1") == 2
 
 
-def test_nothing_half_made_is_left(
+def test_an_interrupted_render_leaves_nothing(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from cleargs.render.output import ShotRenderer
 
-    whole = ShotRenderer.picture
-    taken: list[Any] = []
+    original = ShotRenderer.picture
+    rendered: list[Any] = []
 
-    def breaks_off(self: ShotRenderer, shot: Any) -> Any:
-        taken.append(shot)
-        if len(taken) == 4:
+    def interrupted(self: ShotRenderer, shot: Any) -> Any:
+        rendered.append(shot)
+        if len(rendered) == 4:
             raise KeyboardInterrupt
-        return whole(self, shot)
+        return original(self, shot)
 
-    monkeypatch.setattr(ShotRenderer, "picture", breaks_off)
+    monkeypatch.setattr(ShotRenderer, "picture", interrupted)
     for output in (tmp_path / "film.mp4", tmp_path / "shots" / "%02d.png"):
-        taken.clear()
+        rendered.clear()
         assert render(run, output, "--fps", "5", "--seconds", "2") == 130
         assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""A batch made by hand, with names that try to break its page."""
+"""A batch of hand-made runs, with names that try to break its page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAUSE = "<script>window.hacked = 1</script> cannot be read"
 
 
 def batch_page(root: Path) -> Path:
-    """The page of three scenes: done with a report, to do without one, failed."""
+    """The page of three scenes: one done with a report, one waiting without a report, one failed."""
     folder = root / "captures & more.batch"
     attic = FinishedRun(folder / "scenes", "attic")
     with DigestMemo(root / "digests.sqlite") as memo:

@@ -1,4 +1,4 @@
-"""A page taken apart: what tests of pages ask of it."""
+"""A parser of pages, and checks that tests of pages share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Page(HTMLParser):
 
 
 def links(page: Page) -> list[str]:
-    """All that the page loads or leads to."""
+    """All URLs that the page loads or links to."""
     return [
         value
         for _, attributes in page.elements
@@ -37,7 +37,7 @@ def links(page: Page) -> list[str]:
 
 
 def assert_offline(page: Path) -> None:
-    """Nothing is loaded from a network, and everything that the page shows is there."""
+    """Assert that a page loads nothing from a network, and that all its files exist."""
     parsed, text = Page(page.read_text()), page.read_text()
     assert not [link for link in links(parsed) if re.match(r"(https?:)?//", link)]
     style = re.search(r"<style>(.*?)</style>", text, re.S)[1]

@@ -1,4 +1,4 @@
-"""A finished run made by hand: seven frames of a wall of blobs, two scenes, names that try to break pages."""
+"""A hand-made finished run: seven frames of a wall of blobs, two scenes, names that try to break pages."""
 
 from __future__ import annotations
 
@@ -50,8 +50,9 @@ WEIGHTS = (0.9, 0.6, 0.4, 0.99, 0.1, 0.0, 0.0)
 
 
 def wall(seed: int, gaussians: int = 4000, sh_degree: int = 1) -> Scene:
-    """Opaque coloured blobs at depth 2, wider than the view of any camera. They are small, since large ones
-    that lie close together are drawn in an order that differs between renderers.
+    """Opaque coloured blobs at depth 2, wider than the view of any camera.
+
+    They are small, since renderers draw large blobs at similar depths in different orders.
     """
     chance = np.random.default_rng(seed)
 
@@ -74,7 +75,7 @@ def wall(seed: int, gaussians: int = 4000, sh_degree: int = 1) -> Scene:
 
 
 def camera(index: int, height: float = HEIGHT, width: float = WIDTH) -> Camera:
-    """The cameras stand side by side, turned a little towards the middle."""
+    """One of several cameras side by side, rotated a little towards the middle."""
     angle = 0.05 * (index - 3)
     pose = np.eye(4)
     pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -83,7 +84,7 @@ def camera(index: int, height: float = HEIGHT, width: float = WIDTH) -> Camera:
 
 
 class FinishedRun:
-    """``folder`` as `cleargs run` leaves it, all five stages done, the frames ``held_out`` for testing."""
+    """A run folder as `cleargs run` writes it, with all five stages done."""
 
     def __init__(self, root: Path, name: str = "run", held_out: Sequence[int] = ()) -> None:
         self.folder = root / name
@@ -104,7 +105,7 @@ class FinishedRun:
         self._trained("consolidate", consolidated | {"psnr_unseen": 24.6})
 
     def planner(self, store: Store) -> Planner:
-        """A planner of this run on one thread."""
+        """A planner of this run with one thread."""
         return Planner(self.dag, self.run, store, 1, SilentReporter())
 
     def finish(self, stage: str, summary: dict[str, Any]) -> None:

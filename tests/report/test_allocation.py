@@ -1,4 +1,4 @@
-"""The picture of RVA's allocation: which frames it shows, where it writes, and that they are in it."""
+"""The picture of RVA's allocation, and its choice of frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from cleargs.capture import tables as ingest
 from cleargs.errors import InputError
 from cleargs.parquet import read_table, write_table
-from cleargs.report.allocation_picture import Row, extremes, plot_allocation
+from cleargs.report.allocation_picture import Row, extreme_frames, plot_allocation
 from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from
 from cleargs.rva.tables import BINS, FRAMES
 from cleargs.stages.rva import RvaConfig
@@ -24,13 +24,13 @@ UNREGISTERED, HELD_OUT, UNSCORED = 3, 5, 7
 
 
 def colour_of(k: int) -> tuple[int, int, int]:
-    """The flat colour of frame k's image (BGR): none that the plot uses elsewhere."""
+    """The flat colour of frame k's image (BGR), which the plot does not use elsewhere."""
     return 250 - 3 * k, 190, 13 + 5 * k
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What ingest and rva left of twelve flat images: good at first, then hopeless, with gaps."""
+    """Results of ingest and rva for twelve flat images: first good, then bad, with gaps."""
     root = tmp_path_factory.mktemp("run")
     (root / "ingest" / "images").mkdir(parents=True)
     (root / "rva").mkdir()
@@ -80,7 +80,7 @@ def ids(shown: dict[str, list[Row]]) -> dict[str, list[int]]:
 
 
 def keep(run: Path, folder: Path, count: int, **changes: Any) -> Path:
-    """A copy of ``run``'s tables with its first frames only, and with other values in all rows."""
+    """A copy of ``run`` with only its first frames, and with ``changes`` in all rows."""
     shutil.copytree(run, folder)
     rows = [row | changes for row in rows_of(run)[:count]]
     write_table(folder / "rva" / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
@@ -91,20 +91,20 @@ def plot(path: Path, run: Path, title: str = "twelve") -> None:
     plot_allocation(path, run / "rva", run / "ingest", title)
 
 
-def test_extremes(run: Path) -> None:
+def test_extreme_frames(run: Path) -> None:
     rows = rows_of(run)
-    shown = ids(extremes(rows))
-    # Ten frames have scores, which fall from frame to frame: the better half, and the others from the end.
+    shown = ids(extreme_frames(rows))
+    # Ten frames have scores, which decrease over time: the better half, and the others from the end.
     assert shown["best by R - B"] == [0, 1, 2, 3, 4]
     assert shown["worst by R - B"] == [11, 10, 9, 8, 6]
     revived = [row["frame_id"] for row in rows if row["role"] == "reactivated"]
     assert revived and shown[f"reactivated: {len(revived)} of {len(revived)}"] == revived
 
 
-def test_pictures_of_a_long_capture_lie_apart() -> None:
-    """The extremes of a slow change are one view over and over, unless they keep a twentieth's distance."""
+def test_frames_of_a_long_capture_are_apart() -> None:
+    """Without the distance of a twentieth, the extremes of a slow change would all show the same view."""
     rows = [{"frame_id": k, "R": k / 2000, "B": 1 - k / 2000, "role": "reactivated"} for k in range(2000)]
-    assert ids(extremes(rows, most=3)) == {
+    assert ids(extreme_frames(rows, most=3)) == {
         "best by R - B": [1999, 1899, 1799],
         "worst by R - B": [0, 100, 200],
         "reactivated: 3 of 2000": [0, 1000, 1999],
@@ -115,7 +115,7 @@ def test_every_pictured_frame_is_in_the_picture(run: Path, tmp_path: Path) -> No
     plot(tmp_path / "a.png", run)
     picture = cv2.imread(str(tmp_path / "a.png"))
     assert picture is not None
-    pictured = {frame for frames in ids(extremes(rows_of(run))).values() for frame in frames}
+    pictured = {frame for frames in ids(extreme_frames(rows_of(run))).values() for frame in frames}
     for k in range(COUNT):
         area = np.count_nonzero((picture == colour_of(k)).all(axis=-1))
         assert (area > 20_000) == (k in pictured), f"frame {k}: {area} px"  # a thumbnail has about 100,000
@@ -127,7 +127,7 @@ def test_every_pictured_frame_is_in_the_picture(run: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_few_frames_are_enough(run: Path, tmp_path: Path, count: int) -> None:
     few = keep(run, tmp_path / "few", count, stand_in=True)
-    plot(tmp_path / "few.png", few, "$few_{$")  # a name, no formula
+    plot(tmp_path / "few.png", few, "$few_{$")  # a name, not a formula
     assert cv2.imread(str(tmp_path / "few.png")) is not None
 
 

@@ -23,7 +23,7 @@ def test_the_page_holds_all_that_it_shows_and_leads_to(page: Path) -> None:
     assert [image["alt"] for image in parsed.all("img")] == ["barn: the first frame", "attic: the scene"]
 
 
-def test_the_worst_comes_first_and_figures_say_their_meaning(page: Path) -> None:
+def test_the_worst_scene_comes_first(page: Path) -> None:
     text = " ".join(Page(page.read_text()).text.split())
     assert "1 of 3 scenes is done" in text and "1 failed, 1 waiting, 1 done" in text
     cards = text[text.index("All 3") :]

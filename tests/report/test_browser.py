@@ -22,9 +22,9 @@ from cleargs.splat.render import Viewer
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 DIFFERENCE = 12.0
-"""Mean absolute difference of a viewer's pixels from ours, in levels of 255. Measured: 9, nearly all of
-it darkness at the rim of splats: PlayCanvas bends the Gaussian so that it ends at zero where it is cut off.
-The same scene from the next camera, and the other scene from the same camera, by 35 to 42."""
+"""Maximum mean absolute difference between a viewer's pixels and ours, in levels of 255. Measured: 9, mostly
+from darker rims of splats, since PlayCanvas bends the Gaussian so that it is zero at its cut-off. For the
+next camera, or for the other scene, the difference is 35 to 42."""
 
 
 class Report(Opened):
@@ -56,7 +56,7 @@ class Report(Opened):
         self.page.wait_for_timeout(600)
 
     def pixels(self, scene: str) -> np.ndarray:
-        """What a viewer shows, RGB, as floats."""
+        """Pixels of a viewer, RGB, as floats."""
         self.page.add_style_tag(
             content="figcaption, .status { visibility: hidden } .pane { border-radius: 0 }"
         )
@@ -114,7 +114,7 @@ def difference(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def test_both_viewers_show_their_scene_at_the_opening_pose(wide: Report, run: FinishedRun) -> None:
-    start = 3  # of the frames with the greatest weight, the one in the middle
+    start = 3  # the middle one of the frames with the largest weights
     for pane, stage, other in (("before", "g0", "consolidate"), ("after", "consolidate", "g0")):
         shown = wide.pixels(pane)
         assert min(shown.shape[:2]) > 100 and shown.std() > 20
@@ -176,9 +176,9 @@ def test_the_strip_opens_the_layers_under_a_slider(wide: Report) -> None:
     assert not page.locator("#inspector").is_visible()
 
 
-def test_no_complaint_no_stranger_and_no_script_from_a_name(wide: Report) -> None:
+def test_no_error_no_network_and_no_script_from_a_name(wide: Report) -> None:
     assert wide.complaints == []
-    assert wide.strangers() == []
+    assert wide.network_requests() == []
     assert wide.page.evaluate("window.hacked") is None
 
 
@@ -193,7 +193,7 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(phone: Report) -> None:
 
 
 def test_dark_and_light_keep_their_contrast(wide: Report, phone: Report) -> None:
-    """WCAG AA, 4.5, for text on the page and on its cards, and 3 for the faint notes."""
+    """Text on the page and on its cards has the contrast 4.5 of WCAG AA, and faint notes have 3."""
     script = """() => {
         const probe = document.body.appendChild(document.createElement('i'));
         const rgb = (name) => {

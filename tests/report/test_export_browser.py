@@ -1,4 +1,4 @@
-"""Exported scenes in the viewer that reports carry: what it shows is what was exported."""
+"""Exported scenes in the viewer of the report."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_C
 SIZE = 320, 180
 FRAME = 3
 DIFFERENCE = 12.0
-"""Mean absolute difference from our picture, of 255, as in the tests of the report, where another camera's
-is 35."""
+"""Maximum mean absolute difference from our image, in levels of 255, as in the tests of the report. Another
+camera's image differs by 35."""
 
 PAGE = """<!doctype html><style>
 body { margin: 0 } #live, .sse-viewer, .sse-viewer > canvas { position: absolute; width: 100%; height: 100% }
@@ -54,7 +54,7 @@ window.show = async (content, name, settings) => {
 
 
 def settings(camera: Camera) -> dict[str, Any]:
-    """The viewer's settings (its schema, version 2): nothing but where it stands."""
+    """Minimal settings of the viewer (version 2 of its schema) with the pose of its camera."""
     effects = ("sharpness", "bloom", "grading", "vignette", "fringing")
     return {
         "version": 2,

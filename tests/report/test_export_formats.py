@@ -1,4 +1,4 @@
-"""``cleargs export`` of a whole run: worlds, endings, and what is there already."""
+"""``cleargs export`` of a whole run: coordinates, endings, and existing files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_every_format_in_both_worlds(run: FinishedRun, kind: str, tmp_path: Path
     assert here != there
     cameras = [json.loads((tmp_path / f"{name}.cameras.json").read_text()) for name in ("here", "there")]
     assert len(cameras[0]) == 6  # the placed frames
-    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # as the run notes it
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the similarity of the run
     moved = 2.5 * turn @ cameras[0][2]["position"] + [1.0, -2.0, 3.0]
     assert np.allclose(cameras[1][2]["position"], moved)
     models = [read_model(tmp_path / f"{name}.colmap/sparse/0") for name in ("here", "there")]
@@ -73,8 +73,8 @@ def test_an_unknown_ending_writes_nothing(
     assert ".compressed.ply" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
-def told(capsys: pytest.CaptureFixture[str], pattern: str) -> list[float]:
-    """The numbers that a line of the output gives."""
+def numbers(capsys: pytest.CaptureFixture[str], pattern: str) -> list[float]:
+    """The numbers in the output that the groups of ``pattern`` match."""
     found = re.search(pattern, capsys.readouterr().out)
     assert found is not None
     return [float(number) for number in found.groups()]
@@ -83,29 +83,29 @@ def told(capsys: pytest.CaptureFixture[str], pattern: str) -> list[float]:
 PRUNED = r"pruned (\d+) of 4000 Gaussians; PSNR of 5 training frames ([\d.]+) -> ([\d.]+) dB"
 
 
-def test_pruning_tells_what_it_costs(
+def test_pruning_reports_its_cost(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Half of the wall lies outside every view, and a threshold of many pixels leaves little to see."""
+    """Half of the wall is outside all views. A threshold of many pixels removes most of the rest."""
     assert export(run, tmp_path / "a.ply", "--prune", "contribution:0.0001") == 0
-    gone, before, after = told(capsys, PRUNED)
-    assert gone > 1000 and before == after  # what nobody sees costs nothing
+    gone, before, after = numbers(capsys, PRUNED)
+    assert gone > 1000 and before == after  # invisible Gaussians do not change the PSNR
     assert read_ply(tmp_path / "a.ply").gaussians.num == 4000 - gone
     assert export(run, tmp_path / "b.ply", "--prune", "contribution:20") == 0
-    more, same, worse = told(capsys, PRUNED)
+    more, same, worse = numbers(capsys, PRUNED)
     assert more > gone and same == before and worse < before - 1.0
     assert export(run, tmp_path / "c.ply", "--prune", "opacity:0.9", "--prune", "contribution:0.0001") == 0
-    both, _, _ = told(capsys, PRUNED)
+    both, _, _ = numbers(capsys, PRUNED)
     kept = read_ply(tmp_path / "c.ply").gaussians
     assert both > gone and float(torch.sigmoid(kept.logit_opacities).min()) >= 0.9
 
 
-def test_a_crop_keeps_what_lies_in_the_box_of_the_cameras_world(
+def test_a_crop_uses_the_coordinates_of_the_cameras(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(run, tmp_path / "a.ply", "--crop", "box:-1,-1,0,1,1,2") == 0
     means = read_ply(tmp_path / "a.ply").gaussians.means
-    (gone,) = told(capsys, r"cropped to the box -1,-1,0,1,1,2: (\d+) of 4000 Gaussians lie outside")
+    (gone,) = numbers(capsys, r"cropped to the box -1,-1,0,1,1,2: (\d+) of 4000 Gaussians are outside")
     assert 0 < len(means) == 4000 - gone and float(means.abs().max()) <= 2.0
     assert export(run, tmp_path / "b.ply", "--crop", "percentile:80", "--world", "input") == 0
     kept = read_ply(tmp_path / "b.ply").gaussians.num

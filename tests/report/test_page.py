@@ -1,4 +1,4 @@
-"""The report as files: what is in it, what is not, and that nothing in a capture can break it."""
+"""The files of a report: their contents, and their safety against hostile names in a capture."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
-from cleargs.cli.report import older_report, report_on
+from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest, write_manifest
@@ -29,7 +29,7 @@ from cleargs.report.frames import FrameRow
 from cleargs.report.page import changed_settings, command, json_in_html, weight_colour, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
 from cleargs.report.verdict import ReportVerdict
-from cleargs.report.web_scene import BYTES, shown_degree, write_scene
+from cleargs.report.web_scene import SCENE_BYTES, shown_degree, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_every_file_that_the_page_names_is_there(page: Path, parsed: Page) -> No
     frames = {frame["id"]: frame for frame in data["frames"]}
     assert set(frames[0]["layers"]) == {"observed", "restored", "render", "final"}
     assert set(frames[5]["layers"]) == {"observed", "final"}  # no repair was tried
-    assert set(frames[6]["layers"]) == {"observed"} and frames[6]["time"] is None  # it has no place
+    assert set(frames[6]["layers"]) == {"observed"} and frames[6]["time"] is None  # it has no pose
     assert frames[0]["chosen"] == "restored" and frames[4]["chosen"] is None
 
 
@@ -107,8 +107,8 @@ def test_the_verdict_names_settings_that_exist(parsed: Page, run: FinishedRun) -
     for chip in chips:
         section, _, name = str(chip).removeprefix("--set ").partition("=")[0].partition(".")
         assert name in type(sections[section]).model_fields
-    assert "The first scene follows the trusted training frames fairly closely." in parsed.text
-    assert "24.0 dB before, 25.5 dB now" in parsed.text
+    assert "Fair: the first scene matches the best training frames reasonably well." in parsed.text
+    assert "not repaired rose from 24.0 dB to 25.5 dB." in parsed.text
     assert "1 stretch of the path" in parsed.text
 
 
@@ -125,8 +125,9 @@ def test_a_report_knows_whether_it_is_current(run: FinishedRun, store: Store, pa
     assert is_current(run.folder, manifests)
     other = manifests["g0"].model_copy(update={"key": "0" * 64})
     assert not is_current(run.folder, {**manifests, "g0": other})
-    again = write_report(run.planner(store))  # what the last run did is kept
-    assert "1.2 GB of memory" in Page(again.read_text()).text and "made anew" in again.read_text()
+    again = write_report(run.planner(store))  # keeps the record of the last run
+    text = Page(again.read_text()).text
+    assert "Peak memory of the last run: 1.2 GB." in text and "computed in the last run" in text
     assert not [path for path in run.folder.iterdir() if "partial" in path.name]
 
 
@@ -139,27 +140,28 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
 
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         planner = run.planner(Store(tmp_path, memo))
-        page = report_on(planner, outcomes("found"))
-        assert page == run.folder / "report/index.html" and "found in the store" in page.read_text()
+        page = write_run_report(planner, outcomes("found"))
+        assert page == run.folder / "report/index.html" and "reused in the last run" in page.read_text()
         page.write_text("as it was")
-        assert report_on(planner, outcomes("found")) == page and page.read_text() == "as it was"
-        assert report_on(planner, outcomes("made")) == page and "made anew" in page.read_text()
+        assert write_run_report(planner, outcomes("found")) == page and page.read_text() == "as it was"
+        assert write_run_report(planner, outcomes("made")) == page
+        assert "computed in the last run" in page.read_text()
         (run.folder / "consolidate/scene.ply").write_bytes(b"damaged")
-        assert report_on(planner, outcomes("made")) is None  # the run itself has succeeded
-        assert "made anew" in page.read_text()  # the report before stays
+        assert write_run_report(planner, outcomes("made")) is None  # the run itself has succeeded
+        assert "computed in the last run" in page.read_text()  # the report before stays
         (run.folder / "ingest/manifest.json").unlink()
-        assert report_on(planner, outcomes("found")) is None  # there is nothing to report on
+        assert write_run_report(planner, outcomes("found")) is None  # there is nothing to report on
 
 
-def test_an_older_report_is_told_of_where_no_new_one_is_made(tmp_path: Path) -> None:
+def test_an_older_report_gets_a_note(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
-    assert older_report(run.folder, run.dag) == "", "there is none"
+    assert outdated_report_note(run.folder, run.dag) == "", "there is none"
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         page = write_report(run.planner(Store(tmp_path, memo)))
-    assert older_report(run.folder, run.dag) == ""
+    assert outdated_report_note(run.folder, run.dag) == ""
     (run.folder / "consolidate/manifest.json").unlink()
-    line = older_report(run.folder, run.dag)
-    assert line == f"note: {page} shows earlier results; `cleargs report {run.folder}` makes it anew"
+    line = outdated_report_note(run.folder, run.dag)
+    assert line == f"note: {page} shows earlier results; update it with `cleargs report {run.folder}`"
 
 
 def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
@@ -168,7 +170,7 @@ def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
         shutil.rmtree(run.folder / stage)
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-    assert "no scene is trained yet" in text and is_current(
+    assert "No scene is trained yet" in text and is_current(
         run.folder, linked_manifests(run.folder, run.dag.names)
     )
     assert "none tried" in text and "the restored frame" not in text
@@ -183,7 +185,7 @@ def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
     )
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-    assert "No frame needed a repair" in text and "After the repairs" not in text
+    assert "No frame needed a repair." in text and "With the repairs" not in text
 
 
 def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
@@ -192,13 +194,13 @@ def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
         for stage in ("rivr", "consolidate"):
             (run.folder / stage / "manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-        assert "no repair changed it" in text and "repairs included" not in text
+        assert "no repair changed it" in text and "with repairs" not in text
         (run.folder / "g0/manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-        assert "no scene is trained yet" in text and 'id="stage"' not in text
+        assert "No scene is trained yet" in text and 'id="stage"' not in text
         for stage in ("ingest", "rva"):
             (run.folder / stage / "manifest.json").unlink()
-        with pytest.raises(InputError, match="nothing is done"):
+        with pytest.raises(InputError, match=r"no stage of .* is finished"):
             write_report(run.planner(Store(tmp_path, memo)))
 
 
@@ -211,7 +213,7 @@ def test_a_scene_in_a_report_is_bounded(tmp_path: Path) -> None:
     assert write_scene(tmp_path / "scene.js", "after", scene) == 2
     script = (tmp_path / "scene.js").read_bytes()
     packed = gzip.decompress(b64decode(script.split(b'"')[3]))
-    assert b"element vertex 2000\n" in packed and len(script) < BYTES
+    assert b"element vertex 2000\n" in packed and len(script) < SCENE_BYTES
 
 
 def test_weights_run_from_amber_to_teal() -> None:

@@ -22,7 +22,7 @@ def test_page_fits_its_screen(browser: Any, made: Path, size: str) -> None:
     check_page(browser, made.as_uri(), size)
 
 
-def test_scenes_are_told_apart_by_their_state(browser: Any, made: Path) -> None:
+def test_scenes_are_filtered_by_their_state(browser: Any, made: Path) -> None:
     page = browser.new_page(viewport=SIZES["wide"])
     opened = Opened(page, made.as_uri())
     page.locator('#filters [data-kind="failed"]').press("Enter")
@@ -30,5 +30,5 @@ def test_scenes_are_told_apart_by_their_state(browser: Any, made: Path) -> None:
     assert page.locator("#strip li:visible").count() == 1
     page.locator('#filters [data-kind=""]').click()
     page.get_by_role("link", name="Report of attic").click()
-    assert page.url.endswith("/scenes/attic/report/index.html") and opened.strangers() == []
+    assert page.url.endswith("/scenes/attic/report/index.html") and opened.network_requests() == []
     page.close()

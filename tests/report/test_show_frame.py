@@ -1,4 +1,4 @@
-"""`cleargs show RUN --frame N`: all about one frame, for people and for programs, and its layers as a PNG."""
+"""`cleargs show RUN --frame N`: data of one frame as text and JSON, and its layers as a PNG."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def test_a_frame_in_words_fits_100_columns(
     assert max(map(len, lines)) <= 100
     words = " ".join(text.split())
     assert "frame 2 file clip.mp4#2" in words and "time 0.07 s" in words
-    assert "pose at (-0.200, 0.060, " in words
+    assert "pose camera at (-0.200, 0.060, " in words
     assert "role geometric, weight 0.40: B > 0.6, adds views" not in words  # R 0.8 and B 0.1 pass
-    assert "R 0.80 reliable appearance, B 0.10 risk of degradation, G 0.30 worth of its place" in words
+    assert "R 0.80 reliable appearance, B 0.10 risk of degradation, G 0.30 geometric utility" in words
     assert "motion blur 0.70, defocus 0.20" in words and "worst cue motion blur 0.70" in words
-    assert "motion blur, which takes away 62 % of the frame's misfit" in words
+    assert "motion blur, explains 62 % of the misfit" in words
     assert "blur 3.25 px, rolling shutter 0.00 px" in words
-    assert "weight 0.40 before, 0.75 after it" in words
+    assert "weight 0.40 before image formation, 0.75 after it" in words
     assert "round 1 the restored frame (primary score)" in words
     assert "sharp-1: render 80.0, restored 87.0, observed 75.0" in words
     assert "restored from the frame as filmed: blur 4.0 px, skew 0.3 px" in words
@@ -65,11 +65,11 @@ def test_a_frame_for_programs(run: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert blur["value"] == 3.25 and blur["meaning"].endswith("px")
 
 
-def test_layers_stand_side_by_side(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_layers_are_side_by_side(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     facts = json.loads(shown(run, 1, capsys, "--json"))
     assert facts["layers"] == ["observed", "restored", "render", "final"]
     sheet = read_rgb(Path(facts["picture"]))
-    assert sheet.shape[1] == 3 * 240 + 2 * 4, "three beside each other"
+    assert sheet.shape[1] == 3 * 240 + 2 * 4, "three next to each other"
     tile = round(HEIGHT * 240 / 96)
     first, second = sheet[22 : 22 + tile, :240], sheet[22 : 22 + tile, 244:484]
     assert first.std() > 20 and abs(first.astype(float) - second).mean() > 3  # restored is darker
@@ -87,7 +87,7 @@ def test_what_cannot_be_shown_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert invoke(["show", str(run), "--frame", str(COUNT)]) == 2
     assert f"choose one from 0 to {COUNT - 1}" in capsys.readouterr().err
     assert invoke(["show", str(run), "rva", "--frame", "1"]) == 2
-    assert "about all stages" in capsys.readouterr().err
+    assert "cannot be used with a stage" in capsys.readouterr().err
 
 
 def test_a_damaged_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

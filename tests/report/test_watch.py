@@ -1,4 +1,4 @@
-"""``cleargs watch`` over real sockets: what it shows, and what it hands to nobody."""
+"""``cleargs watch`` over real sockets: the responses that it sends, and the requests that it refuses."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def port(finished: FinishedRun) -> Iterator[int]:
 
 
 def ask(port: int, path: str, method: str = "GET", headers: dict[str, str] | None = None) -> Answer:
-    """What the server answers; ``path`` goes out as it is."""
+    """The server's response to a request, with ``path`` sent unchanged."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     connection.putrequest(method, path, skip_host=True)
     for name, value in ({"Host": f"127.0.0.1:{port}"} if headers is None else headers).items():
@@ -56,7 +56,7 @@ def ask(port: int, path: str, method: str = "GET", headers: dict[str, str] | Non
     return found
 
 
-# -- what it shows -----------------------------------------------------------------------------------------
+# -- responses ---------------------------------------------------------------------------------------------
 
 
 def test_a_finished_run_is_its_report(finished: FinishedRun, port: int) -> None:
@@ -77,7 +77,7 @@ def test_a_browser_that_asks_for_an_icon_gets_no_error(port: int) -> None:
     assert answer.status == 204 and answer.body == b""
 
 
-def test_a_run_at_work_shows_how_far_it_is_and_its_preview(finished: FinishedRun, port: int) -> None:
+def test_a_running_stage_shows_progress_and_preview(finished: FinishedRun, port: int) -> None:
     assert ask(port, "/preview.png").status == 404
     with working(finished, "rivr") as (_, checkpoints):
         page = ask(port, "/")
@@ -88,7 +88,7 @@ def test_a_run_at_work_shows_how_far_it_is_and_its_preview(finished: FinishedRun
             "ingest": "done",
             "rva": "done",
             "g0": "done",
-            "rivr": "at work",
+            "rivr": "running",
             "consolidate": "done",
         }
         versions = []
@@ -105,7 +105,7 @@ def test_a_run_at_work_shows_how_far_it_is_and_its_preview(finished: FinishedRun
 
 
 def test_results_without_their_report(finished: FinishedRun, tmp_path: Path) -> None:
-    """The page waits; an older report is a click away, and is not taken for the present one."""
+    """The page waits. It links to an older report, but does not treat it as the present one."""
     made = FinishedRun(tmp_path)
     with serving(made) as port:
         assert ask(port, "/").status == 200 and ask(port, "/report/").status == 404
@@ -119,13 +119,13 @@ def test_results_without_their_report(finished: FinishedRun, tmp_path: Path) -> 
 
 
 def test_names_of_runs_and_labels_stay_text(finished: FinishedRun, port: int) -> None:
-    """The page takes the state as text alone."""
+    """The script never inserts the state as HTML."""
     script = ask(port, "/live.js").body.decode()
     assert "innerHTML" not in script and "insertAdjacentHTML" not in script
     assert ask(port, "/live.css").headers["content-type"].startswith("text/css")
 
 
-# -- what it refuses ---------------------------------------------------------------------------------------
+# -- refused requests --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_a_report_folder_that_is_a_link_elsewhere(tmp_path: Path) -> None:
     "name", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example", "", "a b", "[::1"]
 )
 def test_another_name_gets_nothing(port: int, name: str) -> None:
-    """What a browser sends that had a foreign name resolve to this machine."""
+    """Such requests come from a browser for which a foreign name resolves to this machine."""
     for path in ("/", "/report/", "/state.json", "/preview.png"):
         answer = ask(port, path, headers={"Host": name.format(port=port)})
         assert answer.status == 403 and b"Gaussians" not in answer.body
@@ -197,7 +197,7 @@ def test_head_has_the_headers_alone(port: int) -> None:
 
 
 @pytest.mark.parametrize("path", ["/report/", "/state.json", "/none", "/", "/live.js"])
-def test_browsers_are_told_to_be_careful(port: int, path: str) -> None:
+def test_security_headers(port: int, path: str) -> None:
     headers = ask(port, path).headers
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["cross-origin-resource-policy"] == "same-origin"
@@ -205,7 +205,7 @@ def test_browsers_are_told_to_be_careful(port: int, path: str) -> None:
     assert ("content-security-policy" in headers) == (path in ("/", "/live.js"))
 
 
-def test_it_listens_at_this_machine_alone_and_says_what_it_cannot(finished: FinishedRun) -> None:
+def test_the_address_is_local_and_errors_are_reported(finished: FinishedRun) -> None:
     with Server(finished.dag, finished.run, "127.0.0.1", 0) as server:
         assert server.address == f"http://127.0.0.1:{server.server_address[1]}/"
         with pytest.raises(InputError, match="cannot serve at"):

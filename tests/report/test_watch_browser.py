@@ -1,4 +1,4 @@
-"""The page of a run at work in a real browser: it renews itself, and gives way to the report."""
+"""The page of a running stage in a real browser: it updates itself, and opens the report at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_C
 
 
 def until(page: Any, condition: str) -> None:
-    """Asked from outside: the page's own policy lets nothing evaluate text in it."""
+    """Wait for a condition, from outside, since the policy of the page forbids `eval`."""
     for _ in range(TIMEOUT_MS // 50):
         if page.evaluate(condition):
             return
@@ -29,7 +29,7 @@ def until(page: Any, condition: str) -> None:
 
 
 def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "EVERY", 0.0)
+    monkeypatch.setattr(live, "WRITE_INTERVAL_S", 0.0)
     made = reported(tmp_path)
     picture = torch.from_numpy(Viewer(wall(1)).view(camera(1)) / 255)
     complaints: list[str] = []
@@ -47,7 +47,7 @@ def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pyt
             assert page.inner_text("#label") == "<b>G0</b>"  # no markup
             assert page.inner_text("#figures") == "50 of 200 · 20.5 dB, 1000 Gaussians"
             assert page.evaluate("document.querySelector('#progress').value") == 0.25
-            assert page.inner_text("li[data-state='at work']").split() == ["g0", "at", "work"]
+            assert page.inner_text("li[data-state='running']").split() == ["g0", "running"]
             first = page.get_attribute("#picture", "src")
             write_preview(checkpoints / PREVIEW, picture.flip(0))
             until(page, f"document.querySelector('#picture').getAttribute('src') !== '{first}'")

@@ -1,4 +1,4 @@
-"""A finished run that is served, and that may be at work again."""
+"""A finished run that is served, with a stage that may be running again."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def reported(root: Path) -> FinishedRun:
 
 @contextmanager
 def serving(made: FinishedRun) -> Iterator[int]:
-    """The port at which the run is served."""
+    """Serve a run; yield the port."""
     with Server(made.dag, made.run, "127.0.0.1", 0) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -44,7 +44,7 @@ def serving(made: FinishedRun) -> Iterator[int]:
 
 @contextmanager
 def working(made: FinishedRun, stage: str) -> Iterator[tuple[Reporter, Path]]:
-    """A writer of ``stage`` at work: its reporter and its checkpoints."""
+    """Pretend that ``stage`` is running; yield its reporter and its checkpoint folder."""
     store, work = made.run.store, made.run.store / "work" / "key"
     (work / "checkpoints" / "round_01").mkdir(parents=True)
     try:

@@ -1,4 +1,4 @@
-"""Captures at the edge (nothing reliable, one frame; no motion, poses, points or scores), and sparse sums."""
+"""Edge cases (no reliable frame, one frame; no motion, poses, points or scores), and sparse sums."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_unregistered_frames_have_no_geometry_and_no_say() -> None:
 def test_a_blurred_camera_that_does_not_move_keeps_one_frame() -> None:
     cues = uniform_cues([0.1, 0.1, 0.2, 0.2], [0.9] * 4)
     result = assess(ids(4), cues, poses_at(along_x([2.0] * 4)), observations_of({}), CONFIG)
-    # One bin, G = 0 and Z = 1 for all: R decides, and of the tied frames 2 and 3 the earlier.
+    # There is one bin, with G = 0 and Z = 1 for all frames. R decides; frames 2 and 3 tie, the earlier wins.
     assert result.role.tolist() == ["suppressed", "suppressed", "reactivated", "suppressed"]
     assert result.weight.tolist() == [0.0, 0.0, 0.12, 0.0]
 
@@ -90,13 +90,13 @@ def test_unscored_frames_have_no_geometry_and_no_say() -> None:
     assert (result.bin[1], result.role[1], result.weight[1]) == (-1, "suppressed", 0.0)
     assert not result.reliable[1]
     assert result.D[0] == 0.65  # the largest distance is 1: frame 1's place does not count
-    assert result.O.tolist()[::2] == [0.0, 0.0]  # nor do its points, which touch both others'
+    assert result.O.tolist()[::2] == [0.0, 0.0]  # nor do its points, which both others share
     row = frames_table(ids(3), ["a", "b", "c"], "hand-1", cues, result).to_pylist()[1]
     assert [row[name] for name in (*CUE_COLUMNS, "R", "B", "C", "D", "O", "G", "bin", "Z")] == [None] * 19
 
 
 def test_an_unscored_frame_is_not_reactivated() -> None:
-    """It has no gain to compare; the NaN must not win the bin."""
+    """Its gain is NaN, which must not win the bin."""
     cues = uniform_cues([0.1, 0.1, 0.1], [0.9, 0.9, 0.9])
     cues[0] = np.nan
     result = assess(ids(3), cues, poses_at(along_x([0.0, 1.0, 2.0])), observations_of({}), CONFIG)
@@ -137,8 +137,8 @@ def test_a_frame_without_points_has_neither_gain_nor_overlap() -> None:
 def test_points_of_frames_outside_the_table_count_nowhere() -> None:
     cues, poses = uniform_cues([0.8, 0.2], [0.1, 0.1]), poses_at(along_x([0.0, 1.0]))
     alone = assess(ids(2), cues, poses, observations_of({0: [1], 1: [1, 2]}), CONFIG)
-    beside = assess(ids(2), cues, poses, observations_of({0: [1], 1: [1, 2], 7: [1, 2, 3]}), CONFIG)
-    assert beside.C.tolist() == alone.C.tolist()
+    with_other = assess(ids(2), cues, poses, observations_of({0: [1], 1: [1, 2], 7: [1, 2, 3]}), CONFIG)
+    assert with_other.C.tolist() == alone.C.tolist()
     # n_1 = 2, n_2 = 1: C_1 = 1 / (1 + 1/sqrt 2)
     assert alone.C[1] == pytest.approx(1 / (1 + 2**-0.5))
 
@@ -154,7 +154,7 @@ def test_sparse_sums_equal_sets() -> None:
     sets = [set(rng.choice(60, size=rng.integers(0, 30), replace=False).tolist()) for _ in range(25)]
     reference = rng.random(25) < 0.4
     pairs = [(frame, point) for frame, seen in enumerate(sets) for point in seen]
-    pairs += pairs[:10]  # a pair listed twice is still one member of the set
+    pairs += pairs[:10]  # a repeated pair counts once
     rows, points = np.array(pairs).T
     seen = visibility(ids(25), rows, points)
     observers = {point: sum(point in one for one in sets) for point in range(60)}
@@ -172,16 +172,16 @@ def test_sparse_sums_equal_sets() -> None:
 
 
 def test_a_long_capture_needs_no_square_array() -> None:
-    """The peak of all arrays stays far below one of T x T or T x P entries.
+    """Peak memory is far below that of one array of T x T or T x P entries.
 
-    5,000 frames of 40 points, half of which each shares with the next frame: 100,000 points, 200,000
-    observations. One T x T array of float64 has 200 MB, one T x P array of single bytes 500 MB. Blocks of
-    2^20 pairs take 8 MB an array, and a few of them are alive at a time.
+    There are 5,000 frames of 40 points. Each shares half of its points with the next frame, which makes
+    100,000 points and 200,000 observations. One T x T array of float64 has 200 MB, one T x P array of bytes
+    500 MB. Blocks of 2^20 pairs take 8 MB per array, and a few of them are in memory at a time.
     """
     count, points = 5_000, 40
     frame = np.repeat(ids(count), points)
     seen = np.arange(points)[None, :] + (points // 2) * np.arange(count)[:, None]
-    good = np.arange(count) % 3 > 0  # most frames are reliable, so that most pairs are looked at
+    good = np.arange(count) % 3 > 0  # most frames are reliable, so that most pairs are visited
     cues = uniform_cues(np.where(good, 0.9, 0.3), np.where(good, 0.1, 0.7))
     poses = poses_at(along_x(np.linspace(0.0, 1.0, count)))
     observations = Observations(frame, seen.ravel())

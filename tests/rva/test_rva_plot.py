@@ -1,4 +1,4 @@
-"""``cleargs show RUN rva --plot``: the picture of a run, and what it refuses."""
+"""``cleargs show RUN rva --plot``: the plot of a run, and wrong usage."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     return Shell(tmp_path, capsys)
 
 
-def test_the_picture_lies_in_the_run_and_changes_nothing_else(shell: Shell) -> None:
+def test_the_plot_is_the_only_new_file_in_the_run(shell: Shell) -> None:
     before = shell.files()
     code, out, err = shell.plot("--plot")
     picture = shell.folder / "rva-plot.png"
@@ -54,7 +54,7 @@ def test_the_picture_lies_in_the_run_and_changes_nothing_else(shell: Shell) -> N
     assert {name: after[name] for name in before} == before
 
 
-def test_the_picture_can_go_elsewhere(shell: Shell) -> None:
+def test_the_plot_can_go_elsewhere(shell: Shell) -> None:
     elsewhere = shell.root / "new" / "a.png"
     code, out, _ = shell.plot("--plot", "-o", str(elsewhere), "--json")
     assert code == 0 and json.loads(out) == {"stage": "rva", "plot": str(elsewhere)}
@@ -64,9 +64,9 @@ def test_the_picture_can_go_elsewhere(shell: Shell) -> None:
 @pytest.mark.parametrize(
     ("stage", "options", "words"),
     [
-        ("ingest", ["--plot"], "--plot draws the stage rva"),
-        ("rva", ["-o", "a.png"], "--output names the PNG of --plot or --frame"),
-        ("rva", ["--plot", "-o", "a.jpg"], "--output names the PNG of --plot or --frame"),
+        ("ingest", ["--plot"], "--plot needs the stage rva"),
+        ("rva", ["-o", "a.png"], "--output needs --plot or --frame, and a .png file"),
+        ("rva", ["--plot", "-o", "a.jpg"], "--output needs --plot or --frame, and a .png file"),
     ],
 )
 def test_wrong_usage(shell: Shell, stage: str, options: list[str], words: str) -> None:

@@ -1,4 +1,4 @@
-"""What must hold for every capture, found or refuted by hypothesis."""
+"""Properties of every capture, tested with hypothesis."""
 
 from __future__ import annotations
 
@@ -32,9 +32,7 @@ class Capture:
 
 @st.composite
 def captures(draw: st.DrawFn) -> Capture:
-    """Up to 24 frames whose quality comes in levels (so that all roles and ties occur), some without a pose,
-    some without scores.
-    """
+    """Up to 24 frames, some without a pose or scores. Quality has steps, so that all roles and ties occur."""
     n = draw(st.integers(1, 24))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     level = draw(st.sampled_from([0.2, 0.5, 0.8, 1.0]))  # the best quality of the capture
@@ -67,7 +65,7 @@ def test_scores_and_weights_lie_in_the_unit_interval(capture: Capture) -> None:
 
 @given(captures())
 def test_roles_are_ordered(capture: Capture) -> None:
-    """A strong frame never loses to any other, an attenuated one never to a reactivated or suppressed one."""
+    """Weights of strong frames >= those of geometric and auxiliary ones >= those of the other roles."""
     result = capture.assess()
     by_role = {role: result.weight[result.role == role] for role in Role}
     middle = [*by_role[Role.GEOMETRIC], *by_role[Role.AUXILIARY]]
@@ -79,27 +77,27 @@ def test_roles_are_ordered(capture: Capture) -> None:
 
 
 @given(captures())
-def test_every_bin_with_a_frame_ends_with_an_active_one(capture: Capture) -> None:
+def test_every_bin_with_frames_has_an_active_one(capture: Capture) -> None:
     result = capture.assess()
     placed = result.bin >= 0
     assert set(result.bin[placed]) == set(result.bin[placed & (result.weight > 0.0)])
-    # and no more were reactivated than there were uncovered bins
-    revived = result.bin[result.role == Role.REACTIVATED]
-    assert len(revived) == len(set(revived))
-    assert not result.covered[revived].any()
+    # One frame per uncovered bin is reactivated.
+    reactivated = result.bin[result.role == Role.REACTIVATED]
+    assert len(reactivated) == len(set(reactivated))
+    assert not result.covered[reactivated].any()
 
 
 @given(captures(), st.floats(0.0, 1.0))
-def test_the_active_share_holds_and_only_wakes_suppressed_frames(capture: Capture, share: float) -> None:
+def test_active_share_holds_and_changes_only_suppressed_frames(capture: Capture, share: float) -> None:
     plain = capture.assess()
     held = replace(capture, config=capture.config.model_copy(update={"active_share": share})).assess()
     wanted = share * np.count_nonzero(held.bin >= 0)
     assert np.count_nonzero(held.weight) >= wanted - 1e-6
-    woken = held.reactivated_for != plain.reactivated_for
-    assert (plain.role[woken] == Role.SUPPRESSED).all()
-    np.testing.assert_array_equal(held.weight[~woken], plain.weight[~woken])
-    # none beyond what is wanted
-    assert np.count_nonzero(held.weight) < wanted + 1.0 or not woken.any()
+    changed = held.reactivated_for != plain.reactivated_for
+    assert (plain.role[changed] == Role.SUPPRESSED).all()
+    np.testing.assert_array_equal(held.weight[~changed], plain.weight[~changed])
+    # No more frames than required are active.
+    assert np.count_nonzero(held.weight) < wanted + 1.0 or not changed.any()
 
 
 @given(captures(), st.randoms(use_true_random=False))
@@ -114,8 +112,8 @@ def test_permuting_the_rows_permutes_the_table(capture: Capture, random: Random)
 
 
 @given(captures())
-def test_frames_without_pose_or_scores_have_no_say(capture: Capture) -> None:
-    """The others get the same rows, bit for bit, and the same bins when such frames are left out."""
+def test_frames_without_pose_or_scores_have_no_effect(capture: Capture) -> None:
+    """Without such frames the others get the same rows, bit for bit, and the same bins."""
     result = capture.assess()
     kept = capture.poses.registered & ~np.isnan(capture.cues[:, 0])
     poses = Poses(*(getattr(capture.poses, f.name)[kept] for f in fields(Poses)))
@@ -128,9 +126,7 @@ def test_frames_without_pose_or_scores_have_no_say(capture: Capture) -> None:
 
 
 @given(captures(), st.integers(0, 23), st.integers(0, 23))
-def test_a_new_point_shared_with_a_reliable_frame_never_raises_the_gain(
-    capture: Capture, i: int, j: int
-) -> None:
+def test_a_point_shared_with_a_reliable_frame_raises_no_gain(capture: Capture, i: int, j: int) -> None:
     before = capture.assess()
     reference = np.flatnonzero(before.reliable | before.stand_in)
     placed = np.flatnonzero(before.bin >= 0)
@@ -146,7 +142,7 @@ def test_a_new_point_shared_with_a_reliable_frame_never_raises_the_gain(
 
 
 @given(captures())
-def test_reliable_frames_are_the_strong_ones_and_gain_no_coverage(capture: Capture) -> None:
+def test_reliable_frames_are_strong_and_gain_no_coverage(capture: Capture) -> None:
     result = capture.assess()
     np.testing.assert_array_equal(result.reliable, result.role == Role.STRONG)
     assert not result.C[result.reliable].any()

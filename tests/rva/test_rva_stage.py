@@ -1,4 +1,4 @@
-"""The stage from an ingest folder to its two tables, and its settings."""
+"""The stage: from an ingest folder to its two tables, and its settings."""
 
 from __future__ import annotations
 

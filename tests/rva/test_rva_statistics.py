@@ -1,4 +1,4 @@
-"""The statistics evaluator on images of known degradation: blurred in linear light, noised, mis-exposed."""
+"""The statistics evaluator on images of known degradation: blur in linear light, noise, wrong exposure."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from cleargs.rva.evaluator import EvaluatedFrame
 from cleargs.rva.measures import (
     Luminance,
     blocking,
+    blur_sigmas,
     detail_ratios,
-    extents_from_ratios,
     noise_level,
     reduce_luminance,
 )
@@ -33,7 +33,7 @@ SIZE = 240, 320
 
 @pytest.fixture(scope="module")
 def scene() -> Linear:
-    """Linear light [240, 320]: overlapping discs and polygons with sharp, anti-aliased borders."""
+    """Linear light [240, 320]: overlapping polygons with sharp, anti-aliased borders."""
     rng = np.random.default_rng(2)
     canvas = np.full((4 * SIZE[0], 4 * SIZE[1]), 0.3, dtype=np.float32)
     for _ in range(160):
@@ -42,7 +42,7 @@ def scene() -> Linear:
     return cv2.resize(canvas, SIZE[::-1], interpolation=cv2.INTER_AREA).astype(np.float64)
 
 
-def photograph(linear: Linear, noise: float = 0.7) -> Image:
+def srgb_image(linear: Linear, noise: float = 0.7) -> Image:
     """8-bit sRGB [h, w, 3] with white noise of ``noise`` levels."""
     srgb = np.where(
         linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
@@ -51,9 +51,9 @@ def photograph(linear: Linear, noise: float = 0.7) -> Image:
     return np.repeat(np.clip(np.rint(levels), 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
 
 
-def moved(linear: Linear, length: int, *, upright: bool = False) -> Linear:
+def motion_blurred(linear: Linear, length: int, *, vertical: bool = False) -> Linear:
     """Box blur of ``length`` px along the rows, or along the columns."""
-    kernel = np.full((length, 1) if upright else (1, length), 1.0 / length)
+    kernel = np.full((length, 1) if vertical else (1, length), 1.0 / length)
     return np.asarray(cv2.filter2D(linear, -1, kernel, borderType=cv2.BORDER_REFLECT))
 
 
@@ -69,59 +69,59 @@ def cues_of(images: list[Image]) -> dict[str, npt.NDArray[np.float64]]:
     return {**{name: cues[:, k] for k, name in enumerate(CUE_COLUMNS)}, "R": R, "B": B}
 
 
-def beside_sharp(scene: Linear, worse: list[Image]) -> dict[str, npt.NDArray[np.float64]]:
+def between_sharp(scene: Linear, worse: list[Image]) -> dict[str, npt.NDArray[np.float64]]:
     """Cues of the images in ``worse``, each between two sharp frames of the same content."""
-    sharp = photograph(scene)
+    sharp = srgb_image(scene)
     images = [sharp]
     for image in worse:
         images += [image, sharp]
     return {name: values[1::2] for name, values in cues_of(images).items()}
 
 
-def extents_of(scene: Linear, image: Image, noise: float = 0.7) -> npt.NDArray[np.float64]:
+def sigmas_of(scene: Linear, image: Image, noise: float = 0.7) -> npt.NDArray[np.float64]:
     """Extents of the blur in ``image``, the sharp scene being known."""
     ratio, content = (
         detail_ratios(view.reduced, view.valid, noise)
-        for view in (reduce_luminance(image, None), reduce_luminance(photograph(scene), None))
+        for view in (reduce_luminance(image, None), reduce_luminance(srgb_image(scene), None))
     )
-    return extents_from_ratios(ratio, content)
+    return blur_sigmas(ratio, content)
 
 
-@pytest.mark.parametrize("upright", [False, True])
-def test_extents_find_the_direction_and_the_length_of_a_motion(scene: Linear, upright: bool) -> None:
-    extents = extents_of(scene, photograph(moved(scene, 7, upright=upright)))
-    along, across = (4, 0) if upright else (0, 4)
-    assert extents.argmax() == along
-    # A box of 7 px has a standard deviation of 2.0 px, but more of its spectrum's fine part is left than of a
-    # Gaussian's, and a tile counts with whatever detail lies across the motion: 0.7 of it is found here.
-    assert 0.6 < extents[along] / (7 / 12**0.5) < 1.0
-    # Across the motion oblique edges are widened too (the aperture problem), less the steeper they are.
-    assert extents[across] < 0.6 * extents[along]
+@pytest.mark.parametrize("vertical", [False, True])
+def test_sigmas_give_direction_and_length_of_a_motion(scene: Linear, vertical: bool) -> None:
+    sigmas = sigmas_of(scene, srgb_image(motion_blurred(scene, 7, vertical=vertical)))
+    along, across = (4, 0) if vertical else (0, 4)
+    assert sigmas.argmax() == along
+    # A box of 7 px has a standard deviation of 2.0 px. The measure is 0.7 of it here: a box keeps more fine
+    # detail than a Gaussian, and detail across the motion also counts in a tile.
+    assert 0.6 < sigmas[along] / (7 / 12**0.5) < 1.0
+    # Oblique edges are also wider across the motion (the aperture problem), less so the steeper they are.
+    assert sigmas[across] < 0.6 * sigmas[along]
 
 
 @pytest.mark.parametrize("sigma", [0.7, 1.5, 2.5])
-def test_extent_of_a_gaussian_blur(scene: Linear, sigma: float) -> None:
-    # Blurred in linear light, measured on sRGB: bright sides of edges spread, 15 % at the most here.
-    assert extents_of(scene, photograph(defocused(scene, sigma))) == pytest.approx(np.full(8, sigma), rel=0.2)
+def test_sigma_of_a_gaussian_blur(scene: Linear, sigma: float) -> None:
+    # The blur is in linear light, the measure in sRGB, where bright sides of edges spread: at most 15 % here.
+    assert sigmas_of(scene, srgb_image(defocused(scene, sigma))) == pytest.approx(np.full(8, sigma), rel=0.2)
 
 
-def test_contrast_does_not_pass_for_sharpness(scene: Linear) -> None:
-    blurred = photograph(moved(scene, 7), noise=0.0)
+def test_contrast_does_not_count_as_sharpness(scene: Linear) -> None:
+    blurred = srgb_image(motion_blurred(scene, 7), noise=0.0)
     faint = np.rint(60.0 + 0.5 * blurred).astype(np.uint8)
-    # Rounding is noise of 0.3 levels; some tiles of the faint image have too little structure to be measured.
-    assert extents_of(scene, faint, 0.3) == pytest.approx(extents_of(scene, blurred, 0.3), abs=0.15)
+    # Rounding is noise of 0.3 levels. Some tiles of the faint image have too little structure to be measured.
+    assert sigmas_of(scene, faint, 0.3) == pytest.approx(sigmas_of(scene, blurred, 0.3), abs=0.15)
 
 
 def test_a_sharp_patch_does_not_excuse_a_blurred_frame(scene: Linear) -> None:
-    patch = moved(scene, 9)
+    patch = motion_blurred(scene, 9)
     patch[80:160, 120:200] = scene[80:160, 120:200]
-    extents, throughout = (extents_of(scene, photograph(image)) for image in (patch, moved(scene, 9)))
+    sigmas, throughout = (sigmas_of(scene, srgb_image(image)) for image in (patch, motion_blurred(scene, 9)))
     # The patch is a twelfth of the frame.
-    assert extents.max() > 0.7 * throughout.max()
+    assert sigmas.max() > 0.7 * throughout.max()
 
 
 def test_longer_motion_is_worse(scene: Linear) -> None:
-    cues = beside_sharp(scene, [photograph(moved(scene, length)) for length in (1, 3, 6, 12, 20)])
+    cues = between_sharp(scene, [srgb_image(motion_blurred(scene, length)) for length in (1, 3, 6, 12, 20)])
     assert (np.diff(cues["R"]) < 0.0).all()
     assert (np.diff(cues["B"]) > 0.0).all()
     assert (np.diff(cues["b_motion_blur"]) >= 0.0).all()
@@ -131,19 +131,19 @@ def test_longer_motion_is_worse(scene: Linear) -> None:
 
 
 def test_stronger_defocus_is_worse_and_is_not_motion(scene: Linear) -> None:
-    cues = beside_sharp(scene, [photograph(defocused(scene, sigma)) for sigma in (0.5, 1.0, 2.0, 3.0)])
+    cues = between_sharp(scene, [srgb_image(defocused(scene, sigma)) for sigma in (0.5, 1.0, 2.0, 3.0)])
     assert (np.diff(cues["R"]) < 0.0).all()
     assert (np.diff(cues["b_defocus"]) > 0.0).all()
     assert (cues["b_defocus"][2:] > cues["b_motion_blur"][2:]).all()
 
 
-def test_a_video_blurred_throughout_is_not_excused_by_its_neighbours(scene: Linear) -> None:
-    cues = cues_of([photograph(moved(scene, 12))] * 6)
+def test_neighbours_do_not_excuse_a_video_blurred_throughout(scene: Linear) -> None:
+    cues = cues_of([srgb_image(motion_blurred(scene, 12))] * 6)
     assert (cues["R"] < 0.70).all()
 
 
 def test_exposure(scene: Linear) -> None:
-    cues = beside_sharp(scene, [photograph(np.clip(scene * 2.0**stops, 0, 1)) for stops in (-5, 0, 2.5)])
+    cues = between_sharp(scene, [srgb_image(np.clip(scene * 2.0**stops, 0, 1)) for stops in (-5, 0, 2.5)])
     dark, right, glaring = cues["b_exposure_failure"]
     assert right == 0.0
     assert dark > 0.5
@@ -153,10 +153,10 @@ def test_exposure(scene: Linear) -> None:
 
 def test_noise_is_measured_and_lowers_cleanness(scene: Linear) -> None:
     levels = [0.7, 3.0, 8.0]
-    images = [photograph(scene, noise) for noise in levels]
+    images = [srgb_image(scene, noise) for noise in levels]
     for image, level in zip(images, levels, strict=True):
         luminance = reduce_luminance(image, None)
-        # Rounding to 8 bits adds 0.29 levels; a median of quantised values moves in quarter levels.
+        # Rounding to 8 bits adds 0.29 levels. A median of quantised values has steps of a quarter level.
         assert noise_level(luminance.reduced, luminance.valid) == pytest.approx(
             level, abs=0.35 + 0.05 * level
         )
@@ -165,13 +165,13 @@ def test_noise_is_measured_and_lowers_cleanness(scene: Linear) -> None:
 
 def test_ghosting(scene: Linear) -> None:
     double = 0.5 * scene + 0.5 * np.roll(scene, (9, 14), axis=(0, 1))
-    ghost, sharp = beside_sharp(scene, [photograph(double), photograph(scene)])["b_ghosting"]
+    ghost, sharp = between_sharp(scene, [srgb_image(double), srgb_image(scene)])["b_ghosting"]
     assert ghost > 0.5
     assert sharp == 0.0
 
 
 def test_blocks_are_artifacts(scene: Linear) -> None:
-    clean = photograph(scene)
+    clean = srgb_image(scene)
     coded = cv2.imdecode(cv2.imencode(".jpg", clean, [cv2.IMWRITE_JPEG_QUALITY, 8])[1], cv2.IMREAD_COLOR)
     assert blocking(reduce_luminance(coded, None).full) > 3.0 + blocking(reduce_luminance(clean, None).full)
     artifacts = cues_of([coded, clean])["b_artifacts"]
@@ -179,14 +179,14 @@ def test_blocks_are_artifacts(scene: Linear) -> None:
 
 
 def test_masked_pixels_do_not_count(scene: Linear) -> None:
-    sharp, blurred = photograph(scene), photograph(moved(scene, 15))
+    sharp, blurred = srgb_image(scene), srgb_image(motion_blurred(scene, 15))
     half = sharp.copy()
     half[:, :160] = blurred[:, :160]
     mask = np.full(SIZE, 255, dtype=np.uint8)
     mask[:, :160] = 0
     shown = reduce_luminance(half, mask)
     hidden = reduce_luminance(sharp, mask)
-    # Beyond the support of the filters, what lies under the mask cannot matter.
+    # Measured pixels are farther from the mask than the filters reach, so masked pixels have no effect.
     np.testing.assert_array_equal(
         detail_ratios(shown.reduced, shown.valid, noise=0.7),
         detail_ratios(hidden.reduced, hidden.valid, noise=0.7),
@@ -213,7 +213,7 @@ def test_added_frames_are_the_only_ones_measured(
     views = []
     for k, length in enumerate([1, 9, 5]):
         path = tmp_path / f"{k}.png"
-        cv2.imwrite(str(path), photograph(moved(scene, length)))
+        cv2.imwrite(str(path), srgb_image(motion_blurred(scene, length)))
         views.append(EvaluatedFrame(k, path))
     measured: list[Luminance] = []
 
@@ -234,7 +234,7 @@ def test_added_frames_are_the_only_ones_measured(
     fresh = StatisticsEvaluator().evaluate(views, threads=1, reporter=SilentReporter())
     np.testing.assert_array_equal(grown, fresh)
 
-    # A mask is part of what was measured; so is every byte of the image. A damaged file is made anew.
+    # The key of the cache includes the bytes of image and mask. A damaged file is replaced.
     measured.clear()
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.full(SIZE, 255, dtype=np.uint8))
@@ -245,9 +245,9 @@ def test_added_frames_are_the_only_ones_measured(
     np.testing.assert_array_equal(evaluate(views), fresh)
 
 
-def test_equal_frames_are_kept_by_threads_at_once(scene: Linear, tmp_path: Path) -> None:
+def test_threads_can_cache_equal_frames_at_once(scene: Linear, tmp_path: Path) -> None:
     path = tmp_path / "still.png"
-    cv2.imwrite(str(path), photograph(scene))
+    cv2.imwrite(str(path), srgb_image(scene))
     views = [EvaluatedFrame(k, path) for k in range(16)]
     cues = StatisticsEvaluator(tmp_path / "kept").evaluate(views, threads=8, reporter=SilentReporter())
     assert (cues == cues[0]).all()
@@ -257,7 +257,7 @@ def test_threads_do_not_change_the_cues(scene: Linear, tmp_path: Path) -> None:
     views = []
     for k, length in enumerate([1, 9, 1, 5, 3, 14]):
         path = tmp_path / f"{k}.png"
-        cv2.imwrite(str(path), photograph(moved(scene, length)))
+        cv2.imwrite(str(path), srgb_image(motion_blurred(scene, length)))
         views.append(EvaluatedFrame(k, path))
     one, four = (StatisticsEvaluator().evaluate(views, threads=n, reporter=SilentReporter()) for n in (1, 4))
     np.testing.assert_array_equal(one, four)

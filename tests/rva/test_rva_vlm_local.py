@@ -1,4 +1,4 @@
-"""Qwen3-VL in process: a tiny model of the real architecture with random weights, to the finished table."""
+"""Qwen3-VL in process: the whole stage with a tiny random model of the real architecture."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SPECIAL = (
 
 
 def make_model(folder: Path) -> None:
-    """A Qwen3-VL of two layers on bytes, in a folder with the files that released ones have."""
+    """Write a Qwen3-VL with two layers and a tokenizer of bytes, with the files of a released model."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
@@ -43,12 +43,12 @@ def make_model(folder: Path) -> None:
     sizes = {"hidden_size": 32, "intermediate_size": 64}
     text: dict[str, Any] = {
         **sizes,
-        "vocab_size": 320,  # more than the tokenizer has, as in the released models
+        "vocab_size": 320,  # more than the tokenizer's, as in released models
         "num_hidden_layers": 2,
         "num_attention_heads": 2,
         "num_key_value_heads": 1,
         "head_dim": 16,
-        "initializer_range": 0.3,  # enough for the picture to sway the answer
+        "initializer_range": 0.3,  # large enough that the image changes the reply
         "rope_parameters": {
             "rope_type": "default",
             "rope_theta": 1e4,
@@ -129,22 +129,22 @@ def test_the_weights_are_part_of_the_key(
     assert run(tmp_path / "a", model_dir) == 0
     capsys.readouterr()
     assert run(tmp_path / "a", copy) == 0
-    assert "already there: ingest, rva" in capsys.readouterr().out, "the same model elsewhere"
+    assert "reused: ingest, rva" in capsys.readouterr().out, "the same model elsewhere"
     config = copy / "generation_config.json"
     config.write_text(config.read_text() + "\n")
     assert run(tmp_path / "a", copy) == 0
     assert "(rva " in capsys.readouterr().out
 
 
-def test_a_reply_cut_off_is_no_score(
+def test_a_truncated_reply_is_not_a_score(
     model_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(tmp_path, model_dir, "qwen.max_tokens=64") == 1
-    assert "scored no frame: the reply cannot be used" in capsys.readouterr().err
+    assert "scored no frame: the reply is invalid" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["nothing", "another architecture"])
-def test_folders_that_hold_no_such_model(
+def test_folders_without_such_a_model(
     model_dir: Path, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = tmp_path / "other"
@@ -153,4 +153,4 @@ def test_folders_that_hold_no_such_model(
         transformers.GPT2Config(n_layer=1, n_embd=8, n_head=1).save_pretrained(other)
     assert run(tmp_path, other) == 2
     shown = capsys.readouterr().err
-    assert "holds no Qwen3-VL model" in shown and "Traceback" not in shown
+    assert "cannot load a Qwen3-VL model" in shown and "Traceback" not in shown

@@ -1,4 +1,4 @@
-"""Qwen3-VL over a real HTTP server on loopback that answers well, badly, late, or not at all."""
+"""Qwen3-VL with a real HTTP server on loopback that answers correctly, badly, late, or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from vlm_server import FRAMES, KEY, Answer, Asked, make_ingest, true_cues, truth, two_stages, vlm_server, well
+from vlm_server import (
+    FRAMES,
+    KEY,
+    Answer,
+    Request,
+    answer_truth,
+    make_ingest,
+    true_cues,
+    truth,
+    two_stages,
+    vlm_server,
+)
 
 from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError, InputError, StageError
@@ -40,7 +51,7 @@ Rows = dict[int, dict[str, Any]]
 
 
 class Bench:
-    """The RVA stage on a capture of six frames; a second call resumes from what the first kept."""
+    """The RVA stage on a capture of six frames. A second call resumes from the cache of the first."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -89,9 +100,9 @@ def assert_complete(result: StageResult, rows: Rows) -> None:
     assert {k: cues_of(row) for k, row in rows.items()} == {k: true_cues(k) for k in range(FRAMES)}
 
 
-def first(answer: Answer) -> Callable[[Asked, int], Answer]:
-    """A script that gives ``answer`` to the first request of every frame, then answers well."""
-    return lambda asked, before: answer if before == 0 else well(asked, before)
+def first(answer: Answer) -> Callable[[Request, int], Answer]:
+    """A script that gives ``answer`` to the first request of every frame, then correct answers."""
+    return lambda request, before: answer if before == 0 else answer_truth(request, before)
 
 
 def test_a_server_that_answers_well(bench: Bench) -> None:
@@ -101,19 +112,19 @@ def test_a_server_that_answers_well(bench: Bench) -> None:
     assert {row["evaluator"] for row in rows.values()} == {f"qwen3-vl:{MODEL}:prompt-1"}
     assert rows[0]["role"] == "strong" and rows[5]["R"] == pytest.approx(0.2)
     assert log.frames() == list(range(FRAMES))
-    for asked in log.asked:
-        assert asked.headers["Authorization"] == f"Bearer {KEY}"
-        assert asked.chat["model"] == MODEL
-        assert asked.chat["temperature"] == 0 and asked.chat["seed"] == 7
-        assert asked.image.shape == (48, 64, 3)
-        question = asked.chat["messages"][0]["content"][1]["text"]
-        schema = asked.chat["response_format"]["json_schema"]["schema"]
+    for request in log.requests:
+        assert request.headers["Authorization"] == f"Bearer {KEY}"
+        assert request.chat["model"] == MODEL
+        assert request.chat["temperature"] == 0 and request.chat["seed"] == 7
+        assert request.image.shape == (48, 64, 3)
+        question = request.chat["messages"][0]["content"][1]["text"]
+        schema = request.chat["response_format"]["json_schema"]["schema"]
         assert list(schema["properties"]) == schema["required"] == list(truth(0))
         assert all(name in question for name in truth(0))
 
 
 def test_no_more_requests_at_once_than_allowed(bench: Bench) -> None:
-    with vlm_server(lambda asked, before: Answer(json.dumps(truth(asked.frame)), delay=0.05)) as log:
+    with vlm_server(lambda request, before: Answer(json.dumps(truth(request.frame)), delay=0.05)) as log:
         assert_complete(*bench.run(log.url, concurrency=2))
     assert log.most_at_once == 2
 
@@ -133,10 +144,10 @@ def test_no_more_requests_at_once_than_allowed(bench: Bench) -> None:
     ],
     ids=["429", "500", "503", "breaks off", "no json", "no choice", "dies half way", "late", "drips"],
 )
-def test_passing_faults_are_tried_again(bench: Bench, answer: Answer) -> None:
+def test_transient_errors_are_tried_again(bench: Bench, answer: Answer) -> None:
     with vlm_server(first(answer)) as log:
         assert_complete(*bench.run(log.url, timeout_s=0.6, concurrency=FRAMES, attempts=10))
-    # A busy machine may make a good answer late, too.
+    # On a busy machine a good answer may also be late.
     assert all(log.frames().count(frame) >= 2 for frame in range(FRAMES))
 
 
@@ -152,15 +163,15 @@ def test_the_server_says_how_long_to_wait(bench: Bench, monkeypatch: pytest.Monk
     soon = format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)
     answers = ["7", soon, "next week", None]
 
-    def script(asked: Asked, before: int) -> Answer:
-        if asked.frame or before >= len(answers):
-            return well(asked, before)
+    def script(request: Request, before: int) -> Answer:
+        if request.frame or before >= len(answers):
+            return answer_truth(request, before)
         header = answers[before]
         return Answer(status=429, headers={"Retry-After": header} if header else {}, body=b"")
 
     with vlm_server(script) as log:
         assert_complete(*bench.run(log.url, backoff_s=1.0, concurrency=1))
-    # Seconds; a date an hour ahead, held to two minutes; then the doubled back-off of the next tries.
+    # Seconds; a date in an hour, limited to two minutes; then the doubled back-off of the next tries.
     assert pauses == [7.0, 120.0, 4.0, 8.0]
 
 
@@ -173,8 +184,8 @@ def test_the_server_says_how_long_to_wait(bench: Bench, monkeypatch: pytest.Monk
         (json.dumps({**truth(0), "sharpness": 1.7}), "sharpness lies outside"),
         (json.dumps({**truth(0), "ghosting": -0.1}), "ghosting lies outside"),
         (json.dumps({**truth(0), "ghosting": float("nan")}), "ghosting lies outside"),
-        (json.dumps({**truth(0), "texture": "good"}), "texture is no number"),
-        (json.dumps({**truth(0), "texture": True}), "texture is no number"),
+        (json.dumps({**truth(0), "texture": "good"}), "texture is not a number"),
+        (json.dumps({**truth(0), "texture": True}), "texture is not a number"),
         (json.dumps({**truth(0), "mood": 0.5}), "not asked for"),
         (json.dumps({"sharpness": 0.5}), "lacks structure"),
         (json.dumps(truth(0)) + json.dumps(truth(1)), "differ"),
@@ -184,7 +195,7 @@ def test_the_server_says_how_long_to_wait(bench: Bench, monkeypatch: pytest.Monk
 def test_a_reply_outside_the_schema_is_asked_again(bench: Bench, content: str, complaint: str) -> None:
     with vlm_server(first(Answer(content))) as log:
         assert_complete(*bench.run(log.url))
-    again = [asked.chat["messages"] for asked in log.asked if len(asked.chat["messages"]) > 1]
+    again = [request.chat["messages"] for request in log.requests if len(request.chat["messages"]) > 1]
     assert len(again) == FRAMES
     assert all(complaint in messages[-1]["content"] for messages in again)
 
@@ -198,20 +209,20 @@ def test_a_reply_outside_the_schema_is_asked_again(bench: Bench, content: str, c
     ],
     ids=["fence", "thoughts", "twice"],
 )
-def test_prose_around_the_object_is_passed_over(bench: Bench, words: str) -> None:
-    def script(asked: Asked, before: int) -> Answer:
-        return Answer(words.replace("{}", json.dumps(truth(asked.frame))))
+def test_text_around_the_object_is_ignored(bench: Bench, words: str) -> None:
+    def script(request: Request, before: int) -> Answer:
+        return Answer(words.replace("{}", json.dumps(truth(request.frame))))
 
     with vlm_server(script) as log:
         assert_complete(*bench.run(log.url))
     assert log.frames() == list(range(FRAMES))
 
 
-def test_a_frame_without_a_valid_reply_is_marked_and_tried_again_later(bench: Bench, tmp_path: Path) -> None:
-    def stubborn(asked: Asked, before: int) -> Answer:
-        if asked.frame == 2:
+def test_an_unscored_frame_is_marked_and_tried_again_later(bench: Bench, tmp_path: Path) -> None:
+    def stubborn(request: Request, before: int) -> Answer:
+        if request.frame == 2:
             return Answer(json.dumps({**truth(2), "defocus": 5}))
-        return Answer(status=500, body=b"") if asked.frame == 4 else well(asked, before)
+        return Answer(status=500, body=b"") if request.frame == 4 else answer_truth(request, before)
 
     with vlm_server(stubborn) as log:
         result, rows = bench.run(log.url, asks=2, attempts=3)
@@ -223,7 +234,7 @@ def test_a_frame_without_a_valid_reply_is_marked_and_tried_again_later(bench: Be
         assert (rows[k]["role"], rows[k]["weight"], rows[k]["reliable"]) == ("suppressed", 0.0, False)
     assert cues_of(rows[3]) == true_cues(3)
     supervision = load_supervision(bench.root / "ingest", bench.root / "out", holdout_share=0.125)
-    assert sorted(supervision.views) == [0, 1, 3, 5], "what continues with --allow-partial leaves them out"
+    assert sorted(supervision.views) == [0, 1, 3, 5], "--allow-partial continues without them"
     assert "frame 2" in bench.remarks.warnings[0] and "defocus lies outside" in bench.remarks.warnings[0]
     assert "frame 4" in bench.remarks.warnings[1] and "500" in bench.remarks.warnings[1]
 
@@ -237,87 +248,87 @@ def test_a_frame_without_a_valid_reply_is_marked_and_tried_again_later(bench: Be
 
 
 def test_a_server_that_dies_half_way(bench: Bench) -> None:
-    """Nobody listens after the second frame; the next call, with the server back, asks for the others."""
+    """The server stops after the second frame. The next call, with a new server, asks for the others."""
     with vlm_server(dies_with=2) as log:
         result, rows = bench.run(log.url, attempts=3, concurrency=1)
     assert len(result.missing) == FRAMES - 2
     assert [k for k, row in rows.items() if row["r_sharpness"] is not None] == [0, 1]
     reasons = [warning for warning in bench.remarks.warnings if "was not scored" in warning]
-    assert len(reasons) == FRAMES - 2 and all("nobody answers" in reason for reason in reasons)
+    assert len(reasons) == FRAMES - 2 and all("no server answers" in reason for reason in reasons)
     port = int(log.url.partition("127.0.0.1:")[2].partition("/")[0])
     with vlm_server(port=port) as log:
         assert_complete(*bench.run(log.url))
     assert log.frames() == [2, 3, 4, 5]
 
 
-def test_no_score_at_all_is_a_failure(bench: Bench) -> None:
+def test_a_stage_without_any_score_fails(bench: Bench) -> None:
     with socket.socket() as place:
         place.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{place.getsockname()[1]}/v1"
-    with pytest.raises(StageError, match="scored no frame: nobody answers"):
+    with pytest.raises(StageError, match="scored no frame: no server answers"):
         bench.run(url, attempts=1)
     assert not list((bench.root / "out").iterdir())
 
 
-def test_a_damaged_kept_score_is_asked_for_again(bench: Bench) -> None:
+def test_a_damaged_cache_file_is_replaced(bench: Bench) -> None:
     with vlm_server() as log:
         bench.run(log.url)
         torn, wild, *_ = sorted((bench.root / "kept").iterdir())
         torn.write_text('{"r_sharpness": 0.5')
         wild.write_text(wild.read_text().replace('"r_sharpness": ', '"r_sharpness": 3'))
         assert_complete(*bench.run(log.url))
-    assert len(log.asked) == FRAMES + 2
+    assert len(log.requests) == FRAMES + 2
 
 
-def test_kept_scores_serve_the_same_question_only(bench: Bench) -> None:
+def test_cached_scores_are_for_the_same_question_only(bench: Bench) -> None:
     with vlm_server() as log:
         for settings in ({}, {"model": "other"}, {"image_size": 64}, {"concurrency": 1}):
             bench.run(log.url, **settings)
-    assert len(log.asked) == 3 * FRAMES
+    assert len(log.requests) == 3 * FRAMES
 
 
 def test_a_server_without_structured_output(bench: Bench) -> None:
-    def old(asked: Asked, before: int) -> Answer:
-        if "response_format" in asked.chat:
+    def old(request: Request, before: int) -> Answer:
+        if "response_format" in request.chat:
             return Answer(status=400, body=b'{"error": "unknown field response_format"}')
-        return well(asked, before)
+        return answer_truth(request, before)
 
     with vlm_server(old) as log:
         assert_complete(*bench.run(log.url, concurrency=1))
-    assert sum("response_format" in asked.chat for asked in log.asked) == 1
+    assert sum("response_format" in request.chat for request in log.requests) == 1
 
 
-def test_a_frame_that_the_server_refuses_does_not_end_the_others(bench: Bench) -> None:
-    def narrow(asked: Asked, before: int) -> Answer:
+def test_a_refused_frame_does_not_end_the_others(bench: Bench) -> None:
+    def narrow(request: Request, before: int) -> Answer:
         refusal = Answer(status=400, body=b'{"error": {"message": "image too large"}}')
-        return refusal if asked.frame == 1 else well(asked, before)
+        return refusal if request.frame == 1 else answer_truth(request, before)
 
     with vlm_server(narrow) as log:
         result, _ = bench.run(log.url, concurrency=1)
     assert result.missing == ("frame 1 (1.jpg) was not scored",)
     assert "image too large" in bench.remarks.warnings[0]
-    assert all("response_format" in asked.chat for asked in log.asked if asked.frame != 1)
+    assert all("response_format" in request.chat for request in log.requests if request.frame != 1)
 
 
 @pytest.mark.parametrize(("status", "remedy"), [(401, "API_KEY"), (403, "API_KEY"), (404, "qwen.model")])
-def test_what_no_frame_can_get_past_ends_the_stage(bench: Bench, status: int, remedy: str) -> None:
+def test_an_error_for_all_frames_ends_the_stage(bench: Bench, status: int, remedy: str) -> None:
     echo = json.dumps({"error": {"message": f"not with {KEY}"}}).encode()
     with (
-        vlm_server(lambda asked, before: Answer(status=status, body=echo)) as log,
+        vlm_server(lambda request, before: Answer(status=status, body=echo)) as log,
         pytest.raises(StageError, match=str(status)) as caught,
     ):
         bench.run(log.url, concurrency=1)
     assert remedy in caught.value.hint
     assert KEY not in str(caught.value) + caught.value.hint
-    assert len(log.asked) <= 2
+    assert len(log.requests) <= 2
 
 
-def test_the_key_is_not_carried_to_another_host(bench: Bench) -> None:
+def test_the_key_is_not_sent_to_another_host(bench: Bench) -> None:
     with vlm_server() as other:
         moved = Answer(status=307, headers={"Location": f"{other.url}/chat/completions"}, body=b"")
-        with vlm_server(lambda asked, before: moved) as log, pytest.raises(StageError, match="moved"):
+        with vlm_server(lambda request, before: moved) as log, pytest.raises(StageError, match="moved"):
             bench.run(log.url)
-    assert other.asked == []
+    assert other.requests == []
 
 
 def test_without_the_client(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -333,12 +344,12 @@ def test_no_key_no_header(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.delenv("CLEARGS_VLM_API_KEY")
     with vlm_server() as log:
         bench.run(log.url)
-    assert all("Authorization" not in asked.headers for asked in log.asked)
+    assert all("Authorization" not in request.headers for request in log.requests)
 
 
-def test_a_key_that_no_header_can_carry(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_that_is_invalid_in_a_header(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLEARGS_VLM_API_KEY", "sk-one\nsk-two")
-    with pytest.raises(InputError, match="characters that no key has") as caught:
+    with pytest.raises(InputError, match="characters that are invalid in a key") as caught:
         bench.run("http://127.0.0.1:9/v1")
     assert "sk-one" not in str(caught.value)
 
@@ -347,8 +358,8 @@ def test_a_key_that_no_header_can_carry(bench: Bench, monkeypatch: pytest.Monkey
     "url",
     ["127.0.0.1:8000", "ftp://host/v1", "http://", "http://me:sesame@host/v1", "http://host/v1?key=sesame"],
 )
-def test_addresses_that_cannot_be_used(bench: Bench, monkeypatch: pytest.MonkeyPatch, url: str) -> None:
-    """Refused before anything is written, and not repeated: they may hold a password."""
+def test_invalid_addresses(bench: Bench, monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    """They are refused before anything is written, and not quoted, since they may contain a password."""
     settings = {"rva": {"evaluator": "qwen3-vl", "qwen": {"model": MODEL, "base_url": url}}}
     with pytest.raises(ConfigError, match="base_url") as caught:
         check_document(two_stages(), settings)
@@ -362,7 +373,7 @@ def test_addresses_that_cannot_be_used(bench: Bench, monkeypatch: pytest.MonkeyP
 def test_from_the_command_line(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Model and address from the environment; exit codes; and the key in no file and no line of output."""
+    """Model and address come from the environment. The key is in no file and in no output."""
     monkeypatch.setenv("CLEARGS_VLM_MODEL", MODEL)
     monkeypatch.delenv("CLEARGS_STORE", raising=False)
     folder, recipe = tmp_path / "run", tmp_path / "empty.toml"
@@ -374,9 +385,9 @@ def test_from_the_command_line(
         given += ["--set", "rva.evaluator=qwen3-vl", "--set", "rva.qwen.backoff_s=0"]
         return invoke([*given, "--set", "rva.qwen.attempts=1", "--debug"], two_stages())
 
-    def failing(asked: Asked, before: int) -> Answer:
-        body = f"no: {asked.headers['Authorization']}".encode()
-        return Answer(status=500, body=body) if asked.frame == 3 else well(asked, before)
+    def failing(request: Request, before: int) -> Answer:
+        body = f"no: {request.headers['Authorization']}".encode()
+        return Answer(status=500, body=body) if request.frame == 3 else answer_truth(request, before)
 
     with vlm_server(failing) as log:
         monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
@@ -386,15 +397,15 @@ def test_from_the_command_line(
         assert run() == 0
         assert log.frames() == [3]
         assert run() == 0
-        assert log.frames() == [3], "a finished stage asks nobody"
-    with vlm_server(lambda asked, before: Answer(status=401, body=KEY.encode())) as log:
+        assert log.frames() == [3], "a finished stage sends no requests"
+    with vlm_server(lambda request, before: Answer(status=401, body=KEY.encode())) as log:
         monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
         monkeypatch.setenv("CLEARGS_VLM_MODEL", "other")
         assert run() == 1
     shown = capsys.readouterr()
     assert "missing: rva: frame 3 (3.jpg) was not scored" in shown.err and "***" in shown.err
     written = [file for file in folder.rglob("*") if file.is_file()]
-    assert f'model = "{MODEL}"' not in (folder / "run.toml").read_text(), "the last call named another"
+    assert f'model = "{MODEL}"' not in (folder / "run.toml").read_text(), "the last call named another model"
     assert any(MODEL.encode() in file.read_bytes() for file in written if file.name == "manifest.json")
     for text in (shown.out.encode(), shown.err.encode(), *(file.read_bytes() for file in written)):
         assert KEY.encode() not in text
@@ -409,7 +420,7 @@ def test_the_model_must_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_prompt_changes_with_its_version_only() -> None:
-    """Whoever changes a word raises QwenConfig.prompt, and writes the new digest here."""
+    """If you change a word, raise QwenConfig.prompt and update the digest here."""
     import hashlib
 
     from cleargs.rva.config import QwenConfig

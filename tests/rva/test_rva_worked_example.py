@@ -1,4 +1,4 @@
-"""Five frames and twelve points, every number of both tables worked out by hand, all five roles."""
+"""Five frames, twelve points and all five roles, with every number of both tables computed by hand."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_without_coverage_the_bin_stays_empty() -> None:
     assert bare.weight[3] == 0.0
 
 
-def test_all_view_weighs_every_frame_and_still_knows_the_reliable_one(result: Assessment) -> None:
+def test_all_view_weighs_all_frames_and_keeps_the_scores(result: Assessment) -> None:
     everything = assess(
         FRAME_ID, cues(), POSES, observations_of(POINTS), CONFIG.model_copy(update={"enabled": False})
     )
@@ -147,7 +147,7 @@ def test_all_view_weighs_every_frame_and_still_knows_the_reliable_one(result: As
         (1.0, [1, 1, 1, 1, 1]),
     ],
 )
-def test_dropping_blurry_frames_keeps_the_better_share_whole(share: float, weights: list[int]) -> None:
+def test_binary_weighting_keeps_the_better_share(share: float, weights: list[int]) -> None:
     dropped = assess(
         FRAME_ID,
         cues(),
@@ -181,6 +181,6 @@ def test_summary(result: Assessment) -> None:
     }  # fmt: skip
     assert figures["active"] == 4
     assert figures["weights"]["0.4"] == 2
-    # Kish: 4 equal weights are worth 4 frames, one alone 1.
+    # Kish's sample size of 4 equal weights is 4.
     assert effective_sample_size(np.array([0.5, 0.5, 0.5, 0.5, 0.0])) == pytest.approx(4.0)
     assert effective_sample_size(np.zeros(3)) == 0.0

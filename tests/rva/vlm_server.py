@@ -1,4 +1,4 @@
-"""A server with an OpenAI-compatible chat endpoint on loopback, and a small capture to ask it about."""
+"""A server with an OpenAI-compatible chat endpoint on loopback, and a small capture to score."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ FRAMES = 6
 
 @dataclass
 class Answer:
-    """What the server sends."""
+    """Answer of the server."""
 
     content: str = ""
-    """The model's text, put into a chat completion."""
+    """The model's text, sent in a chat completion."""
     status: int = 200
     headers: Mapping[str, str] = field(default_factory=dict)
     body: bytes | None = None
-    """Sent as it is, in place of a chat completion."""
+    """Sent instead of a chat completion."""
     announced: int | None = None
-    """Content-Length, where it is to be a lie."""
+    """Content-Length, if it should be wrong."""
     delay: float = 0.0
     """Seconds before the first byte."""
     drip: float = 0.0
@@ -49,7 +49,7 @@ class Answer:
 
 
 @dataclass
-class Asked:
+class Request:
     """One request as the server received it."""
 
     headers: Mapping[str, str]
@@ -64,16 +64,16 @@ class Asked:
 
     @property
     def frame(self) -> int:
-        """Which frame of `make_ingest` it shows."""
+        """Number of the frame of `make_ingest` that it shows."""
         return round(float(self.image[0, 0, 0]) / 20) - 1
 
 
-Script = Callable[[Asked, int], Answer]
-"""Request, and how many came for the same frame before -> answer."""
+Script = Callable[[Request, int], Answer]
+"""Request, number of earlier requests for the same frame -> answer."""
 
 
 def truth(frame: int) -> dict[str, float]:
-    """The scores of a frame, by the names of the prompt: frames get worse one by one."""
+    """Scores of a frame by the names of the prompt. Each frame is worse than the one before."""
     good = round(0.95 - 0.15 * frame, 2)
     return {**dict.fromkeys(R_CUES, good), **dict.fromkeys(B_CUES, round(1.0 - good, 2))}
 
@@ -83,26 +83,26 @@ def true_cues(frame: int) -> dict[str, float]:
     return dict(zip(CUE_COLUMNS, truth(frame).values(), strict=True))
 
 
-def well(asked: Asked, before: int) -> Answer:
-    """The script of a server with nothing wrong."""
-    return Answer(json.dumps(truth(asked.frame)))
+def answer_truth(request: Request, before: int) -> Answer:
+    """The script of a server without faults."""
+    return Answer(json.dumps(truth(request.frame)))
 
 
 @dataclass
 class Log:
-    """What a server saw."""
+    """Requests that a server received."""
 
     url: str
-    asked: list[Asked] = field(default_factory=list)
+    requests: list[Request] = field(default_factory=list)
     most_at_once: int = 0
 
     def frames(self) -> list[int]:
-        return sorted(asked.frame for asked in self.asked)
+        return sorted(request.frame for request in self.requests)
 
 
 @contextmanager
-def vlm_server(script: Script = well, port: int = 0, dies_with: int | None = None) -> Iterator[Log]:
-    """A server that answers by ``script`` until the block ends, or dies with a request of that number."""
+def vlm_server(script: Script = answer_truth, port: int = 0, dies_with: int | None = None) -> Iterator[Log]:
+    """Run a server that answers by ``script`` until the block ends, or until request number ``dies_with``."""
     lock = threading.Lock()
     busy = [0]
 
@@ -112,15 +112,15 @@ def vlm_server(script: Script = well, port: int = 0, dies_with: int | None = Non
             with lock:
                 busy[0] += 1
                 log.most_at_once = max(log.most_at_once, busy[0])
-                asked = Asked(dict(self.headers), json.loads(body))
-                before = log.frames().count(asked.frame)
-                log.asked.append(asked)
-            if len(log.asked) == dies_with:
+                request = Request(dict(self.headers), json.loads(body))
+                before = log.frames().count(request.frame)
+                log.requests.append(request)
+            if len(log.requests) == dies_with:
                 server.shutdown()
                 server.server_close()
             try:
                 assert self.path == "/v1/chat/completions"
-                self._send(script(asked, before))
+                self._send(script(request, before))
             except (BrokenPipeError, ConnectionResetError):
                 pass  # the client gave up
             finally:
@@ -159,7 +159,7 @@ def vlm_server(script: Script = well, port: int = 0, dies_with: int | None = Non
 
 
 def make_ingest(folder: Path) -> None:
-    """The outputs of ingest for `FRAMES` frames; the level of their pixels says which is which."""
+    """Write the outputs of ingest for `FRAMES` frames. The level of the pixels encodes the frame number."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rows = []
     for k in range(FRAMES):
@@ -186,7 +186,7 @@ def make_ingest(folder: Path) -> None:
 
 
 class PreparedConfig(BaseModel):
-    """The settings of ingest that a verdict reads."""
+    """The settings of ingest that the report's verdict reads."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     fps: float | None = None
@@ -195,7 +195,7 @@ class PreparedConfig(BaseModel):
 
 @dataclass
 class PreparedIngest:
-    """A stage that publishes `make_ingest`."""
+    """A stage with the outputs of `make_ingest`."""
 
     VERSION: int = 1
     CONFIG: type[BaseModel] = PreparedConfig
@@ -219,6 +219,6 @@ class PreparedIngest:
 
 
 def two_stages() -> Dag:
-    """The real RVA stage behind `PreparedIngest`."""
+    """The real RVA stage after `PreparedIngest`."""
     stages: dict[str, Any] = {"ingest": PreparedIngest(), "rva": import_module("cleargs.stages.rva")}
     return Dag(tuple(stages), stages.__getitem__)

@@ -1,4 +1,4 @@
-"""Steps and Gaussians that the settings leave open."""
+"""Numbers of steps and Gaussians that the settings leave unset."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def test_the_budget_follows_the_pixels_within_bounds() -> None:
     assert 0 < found[0] < found[1] < found[2] == found[3] == 400_000
     assert budget_from_pixels(0, 400_000, "draft") < found[0] < budget_from_pixels(0, 400_000, "high")
     bounded = [budget_from_pixels(10**9, 50_000, quality) for quality in get_args(Quality)]
-    assert bounded == [25_000, 50_000, 100_000]  # a large capture's qualities differ too
+    assert bounded == [25_000, 50_000, 100_000]  # qualities differ for large captures, too
     assert budget_from_pixels(0, 1, "draft") == 1
 
 
-def test_what_is_given_stays() -> None:
+def test_given_steps_and_budget_are_kept() -> None:
     seen = views(images(gaussians(), 3))
     open_ = resolve_config(G0Config(), seen)
     assert open_.length == steps_from_frames(3) and open_.budget == budget_from_pixels(0, 10**6)
@@ -44,10 +44,10 @@ def test_what_is_given_stays() -> None:
     assert DistilConfig().applied_to(G0Config(), 3).length * 16 == steps_from_frames(3)
 
 
-def test_a_training_decides_for_itself() -> None:
+def test_trainer_resolves_open_settings() -> None:
     trainer = Trainer(start(), views(images(gaussians(), 3)), TrainConfig(quality="draft"), seed=(1,))
     assert trainer.length == steps_from_frames(3, "draft")
-    with pytest.raises(ValueError, match="not decided yet"):
+    with pytest.raises(ValueError, match="not set yet"):
         assert TrainConfig().length
 
 
@@ -61,7 +61,7 @@ def test_quality_reaches_every_training() -> None:
     assert invoke(["run", "nowhere.mp4", "-o", "nowhere", "--quality", "best"]) == 2
 
 
-def test_the_growth_of_a_training_is_foreseen() -> None:
+def test_estimated_growth_equals_the_log() -> None:
     config = TrainConfig(steps=120, budget=90)
     trainer = Trainer(start(60), views(images(gaussians(), 3)), config, seed=(1,))
     while trainer.done < trainer.length:
@@ -71,12 +71,12 @@ def test_the_growth_of_a_training_is_foreseen() -> None:
     assert logged[0] == 60 and logged[-1] == 90 and len(set(logged)) > 3
 
 
-def test_later_steps_are_known_to_take_longer() -> None:
+def test_later_steps_are_estimated_to_take_longer() -> None:
     config = TrainConfig(steps=1000, budget=300_000)
     trainer = Trainer(start(60), views(images(gaussians(), 3)), config, seed=(1,))
-    shares = trainer.shares_of_work()
-    assert shares[0] == 0.0 and len(shares) == 1001 and shares[-1] == pytest.approx(1.0)
-    assert shares[500] < 0.5, "growth and full-size images lie in the second half"
+    fractions = trainer.work_fractions()
+    assert fractions[0] == 0.0 and len(fractions) == 1001 and fractions[-1] == pytest.approx(1.0)
+    assert fractions[500] < 0.5, "growth and full-size images are in the second half"
     few, _ = training_cost(config, 100, 0.4, 20_000)
     many, _ = training_cost(config, 100, 0.4)
     assert few < many

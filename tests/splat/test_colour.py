@@ -1,4 +1,4 @@
-"""When exposure compensation is on, and what its table keeps."""
+"""Exposure compensation: gains, centring and the table."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WALL = 0.2
 
 
 def wall(gains: list[float]) -> tuple[list[TrainingView], SparsePoints]:
-    """Views of one textured wall, each with its gain, and the points on the wall at the colours of gain 1."""
+    """Return views of a textured wall with these gains, and points on the wall with the colours of gain 1."""
     rng = np.random.default_rng(0)
     texture = rng.uniform(60, 180, (HEIGHT, WIDTH, 3))
     eye = camera(0.0)
@@ -33,7 +33,7 @@ def wall(gains: list[float]) -> tuple[list[TrainingView], SparsePoints]:
     depth = 1.0 + WALL
     x = (columns + 0.5 - eye.cx) / eye.fx * depth
     y = (rows + 0.5 - eye.cy) / eye.fy * depth
-    xyz = np.stack([x, y, np.full(200, WALL)], axis=1)  # the camera stands at z = -1
+    xyz = np.stack([x, y, np.full(200, WALL)], axis=1)  # the camera is at z = -1
     views = [
         TrainingView(index, eye, 1.0, "real", keep(np.rint(texture * gain).astype(np.uint8)))
         for index, gain in enumerate(gains)
@@ -47,13 +47,14 @@ def wall(gains: list[float]) -> tuple[list[TrainingView], SparsePoints]:
 def test_gains_are_measured_on_the_points() -> None:
     gains = [1.0, 0.8, 1.3, 1.0]
     measured = frame_gains(*wall(gains))
-    # Pixels are whole levels between 48 and 234, three are summed, and a median is taken: under 0.5 %.
+    # Pixels are integers between 48 and 234, three are summed, and the median is taken: the error is below
+    # 0.5 %.
     np.testing.assert_allclose(measured, gains, rtol=5e-3)
     assert gain_spread(measured) == pytest.approx(np.log(gains).std(), rel=0.02)
     assert gain_spread(frame_gains(*wall([1.0, 1.0, 1.0]))) < 0.002
 
 
-def test_masked_points_and_points_out_of_sight_do_not_count() -> None:
+def test_masked_and_invisible_points_do_not_count() -> None:
     views, sparse = wall([1.0])
     nothing = replace(views[0], load=keep(views[0].load()[0], np.zeros((HEIGHT, WIDTH), np.bool_)))
     assert np.isnan(frame_gains([nothing], sparse)).all()
@@ -74,7 +75,7 @@ def test_the_weighted_median_is_the_identity() -> None:
 
 
 def test_a_few_dark_frames_do_not_move_the_others() -> None:
-    """With the mean for a reference, two dark frames of ten made the scene 10 % too dark."""
+    """With the mean as reference, two dark frames out of ten made the scene 10 % too dark."""
     gains = np.array([0.5, 1.0, 1.01, 0.99, np.nan, 1.0, 0.5, 1.0, 1.02, 0.98])
     frame_ids = [9, 8, 7, 6, 5, 4, 3, 2, 1, 0]
     start = Exposure.from_gains(frame_ids, gains)

@@ -1,4 +1,4 @@
-"""``.compressed.ply`` as another reader (gsply) finds it."""
+"""``.compressed.ply``, read by gsply."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def test_another_reader_finds_the_same_scene(count: int, sh_degree: int, tmp_pat
     (tmp_path / "a.compressed.ply").write_bytes(compressed_ply(Scene(made)))
     back = gsply.plyread(str(tmp_path / "a.compressed.ply"))
     made = made.select(torch.from_numpy(morton_order(made.means.numpy())))
-    # Half a step of 10 bits (y) over the range of all chunks, which holds that of each.
+    # The limit is half a step of 10 bits (y) over the range of all chunks, at least that of each chunk.
     for read, wrote in ((back.means, made.means), (back.scales, made.log_scales)):
         reach = np.ptp(wrote.numpy(), axis=0)
         assert (np.abs(read - wrote.numpy()) <= reach / 2**10 / 2 + 1e-5).all()
     assert np.abs(back.sh0 - made.sh[:, 0].numpy()).max() < np.ptp(made.sh[:, 0].numpy()) / 255 / 2 + 1e-4
-    if sh_degree:  # a step is 8/256, and the reader may take its middle or its edge
+    if sh_degree:  # a step is 8/256, and readers may decode its centre or its edge
         assert np.abs(back.shN - made.sh[:, 1:].numpy()).max() <= 8 / 256 + 1e-6
     alpha = 1 / (1 + np.exp(-back.opacities.astype(np.float64)))
     assert np.abs(alpha - torch.sigmoid(made.logit_opacities).numpy()).max() < 0.5 / 255 + 1e-3
@@ -49,7 +49,7 @@ def test_another_reader_finds_the_same_scene(count: int, sh_degree: int, tmp_pat
     assert np.abs(np.abs((back.quats * unit).sum(axis=1)) - 1.0).max() < 1e-5  # 10 bits of each component
 
 
-def test_equal_scenes_give_equal_bytes_and_order_does_not_matter() -> None:
+def test_bytes_do_not_depend_on_the_order_of_gaussians() -> None:
     made = make(700, 1)
     shuffled = made.select(torch.randperm(700, generator=torch.Generator().manual_seed(0)))
     assert compressed_ply(Scene(made)) == compressed_ply(Scene(shuffled))
@@ -62,7 +62,7 @@ def test_neighbours_in_the_file_are_neighbours_in_space() -> None:
     assert len(morton_order(np.zeros((0, 3), np.float32))) == 0
 
 
-def test_scales_without_end_are_clipped() -> None:
+def test_infinite_scales_are_clipped() -> None:
     made = make(3, 0)
     made.log_scales[0] = torch.tensor([-np.inf, np.inf, 0.0])
     assert np.isfinite(np.frombuffer(compressed_ply(Scene(made))[-12 - 48 - 72 : -12 - 48], "<f4")).all()

@@ -1,4 +1,4 @@
-"""A moved scene seen by a moved camera is the same picture."""
+"""A transformed scene has the same render from a transformed camera."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_render_is_unchanged(coefficients: int) -> None:
     back[:3, :3] = ROTATION.T / SCALE
     back[:3, 3] = -ROTATION.T @ TRANSLATION / SCALE
     moved_view = view @ back
-    moved_view[:3] *= SCALE  # the same camera, its unit of length that of the new world
+    moved_view[:3] *= SCALE  # the same camera in units of the new world
     moved_camera = Camera(48, 36, 40.0, 40.0, 24.0, 18.0, moved_view)
 
     moved = transform_scene(scene, scale=SCALE, rotation=ROTATION, translation=TRANSLATION)
@@ -64,10 +64,10 @@ def test_render_is_unchanged(coefficients: int) -> None:
     after = render(double(moved.gaussians), moved_camera)
     unturned = Gaussians(**{**double(moved.gaussians).tensors(), "sh": double(scene.gaussians).sh})
     assert before.max() > 0.3 and before.std() > 0.05
-    # Worst pixel about 2e-6: the moved parameters were rounded to float32.
+    # The largest difference is about 2e-6, from the rounding of the parameters to float32.
     assert torch.allclose(before, after, atol=2e-5)
     if coefficients > 1:
-        assert not torch.allclose(before, render(unturned, moved_camera), atol=1e-2), "SH must turn too"
+        assert not torch.allclose(before, render(unturned, moved_camera), atol=1e-2), "SH must rotate, too"
 
 
 def test_sh_rotation_is_orthogonal_and_composes() -> None:
@@ -83,7 +83,7 @@ def test_sh_rotation_is_orthogonal_and_composes() -> None:
         assert outside.abs().max() < 1e-12, "degrees do not mix"
 
 
-def test_sh_rotation_turns_the_function() -> None:
+def test_sh_rotation_rotates_the_function() -> None:
     rotation = torch.from_numpy(ROTATION)
     coefficients = torch.from_numpy(np.random.default_rng(1).normal(size=16))
     directions = torch.nn.functional.normalize(
@@ -100,7 +100,7 @@ def test_reflections_are_refused() -> None:
         )
 
 
-def test_a_world_beyond_single_precision_is_refused() -> None:
+def test_a_scene_beyond_float32_is_refused() -> None:
     scene = Scene(
         Gaussians(
             means=torch.ones(2, 3),
@@ -112,5 +112,5 @@ def test_a_world_beyond_single_precision_is_refused() -> None:
     )
     # Squares and differences of 1e38 overflow in the writers of packed formats; 1e-150 is 0.
     for scale in (1e39, 1e38, 1e-150):
-        with pytest.raises(InputError, match="single precision"):
+        with pytest.raises(InputError, match="range of float32"):
             transform_scene(scene, scale=scale, rotation=np.eye(3), translation=np.zeros(3))

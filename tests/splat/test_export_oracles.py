@@ -1,4 +1,4 @@
-"""Exported scenes read by PlayCanvas's splat-transform, and by Khronos's glTF validator (`make oracles`)."""
+"""Exported scenes, read by PlayCanvas's splat-transform and Khronos's glTF validator (`make oracles`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cleargs.splat.formats import write_scene
 PACKAGES = Path(__file__).parents[2] / ".oracles/node_modules"
 pytestmark = pytest.mark.skipif(
     shutil.which("node") is None or not PACKAGES.is_dir(),
-    reason="npm's packages are not there (make oracles)",
+    reason="npm's packages are not installed (make oracles)",
 )
 
 VALIDATE = """
@@ -43,19 +43,19 @@ def test_splat_transform_finds_the_same_scene(
     order = np.arange(made.gaussians.num)
     if kind in ("sog", "compressed.ply"):
         order = morton_order(made.gaussians.means.numpy())
-    # Of an .spz it takes the axes to be those of a .ply.
+    # It assumes that .spz files have the axes of .ply files.
     signs = ABOUT_X if kind == "spz" else np.ones(3)
     expected = made.gaussians.select(torch.from_numpy(order))
     within = 0.02 if kind == "compressed.ply" else 2e-3  # half a step of 10 bits over a range of 30
     assert_turned(gaussians(back), expected, signs, sh_within=0.06, means_within=within)
 
 
-def test_the_gltf_validator_knows_all_but_the_extension(tmp_path: Path) -> None:
+def test_gltf_validator_reports_only_the_extension(tmp_path: Path) -> None:
     write_scene(tmp_path / "a.glb", scene(3), "glb")
     command = ["node", "-e", VALIDATE, str(tmp_path / "a.glb")]
     done = subprocess.run(command, cwd=PACKAGES, check=True, capture_output=True, text=True)
     messages = json.loads(done.stdout)
-    # The attributes that KHR_gaussian_splatting brings have names that glTF alone does not allow.
+    # The attributes of KHR_gaussian_splatting have names that glTF without the extension does not allow.
     assert {message["code"] for message in messages} == {
         "UNSUPPORTED_EXTENSION",
         "MESH_PRIMITIVE_INVALID_ATTRIBUTE",

@@ -1,4 +1,4 @@
-"""Scenes in other programs' formats, read back by someone else's reader or by the letter of its text."""
+"""Scenes in other programs' formats, decoded by independent readers or as the specification says."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ABOUT_X, ABOUT_Z = np.array([1.0, -1.0, -1.0]), np.array([-1.0, -1.0, 1.0])
 
 
 def covariances(log_scales: NDArray[np.float32], quaternions: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[N, 3, 3] of log scales and quaternions w x y z: what does not depend on a quaternion's sign."""
+    """Return covariances [N, 3, 3], which do not depend on the sign of a quaternion w x y z."""
     turn = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
     return np.asarray(
         turn * np.exp(2.0 * log_scales.astype(np.float64))[:, None, :] @ turn.transpose(0, 2, 1)
@@ -36,13 +36,13 @@ def covariances(log_scales: NDArray[np.float32], quaternions: NDArray[np.float32
 
 
 def colours(sh: NDArray[np.float32], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What SH coefficients [N, K, 3] show in the directions [M, 3]."""
+    """Return the colours of SH coefficients [N, K, 3] in the directions [M, 3]."""
     basis = sh_basis(torch.from_numpy(directions), sh.shape[1]).numpy()
     return np.asarray(np.einsum("mk,nkc->nmc", basis, sh))
 
 
 def gaussians(back: Any) -> Gaussians:
-    """Gaussians as gsply finds them."""
+    """Return the Gaussians that gsply read."""
     return Gaussians(
         means=torch.from_numpy(np.array(back.means)),
         log_scales=torch.from_numpy(np.array(back.scales)),
@@ -59,7 +59,7 @@ def assert_turned(
     sh_within: float,
     means_within: float = 2e-3,
 ) -> None:
-    """``found`` is ``made`` after half a turn (or none), its colours too."""
+    """Check that ``found`` is ``made`` after half a turn (or none), with its colours."""
     assert np.allclose(found.means.numpy(), made.means.numpy() * signs, atol=means_within)
     expected = covariances(made.log_scales.numpy(), made.rotations.numpy()) * np.outer(signs, signs)
     got = covariances(found.log_scales.numpy(), found.rotations.numpy())
@@ -74,17 +74,17 @@ def assert_turned(
     if (signs == 1.0).all():
         return
     untouched = colours(made.sh.numpy(), seen * signs) - colours(made.sh.numpy(), seen)
-    assert np.abs(untouched).mean() > 4 * sh_within, "the test must notice colours that did not turn"
+    assert np.abs(untouched).mean() > 4 * sh_within, "the test must detect colours that did not rotate"
 
 
 def read_spz(path: Path) -> Any:
-    """A file as gsply finds it: means, log scales, quaternions w x y z, opacity logits, sh0, shN."""
+    """Read a file with gsply: means, log scales, quaternions w x y z, opacity logits, sh0, shN."""
     return pytest.importorskip("gsply.spz").read_spz(str(path))
 
 
 def scene(sh_degree: int = 3, count: int = 300) -> Scene:
     made = make(count, sh_degree)
-    made.sh.clamp_(-0.9, 0.9)  # SPZ holds no more
+    made.sh.clamp_(-0.9, 0.9)  # the range of SPZ
     made.rotations.div_(made.rotations.norm(dim=1, keepdim=True))
     return Scene(made, antialias=True)
 
@@ -98,8 +98,8 @@ def test_spz_read_by_gsply(sh_degree: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
-def test_the_versions_of_spz_hold_the_same_columns(sh_degree: int) -> None:
-    """Version 4 by the letter of its text: a plain header, a table of sizes, a zstd stream a column."""
+def test_spz_versions_have_the_same_columns(sh_degree: int) -> None:
+    """Version 4 has an uncompressed header, a table of sizes, and a zstd stream per column."""
     made = scene(sh_degree)
     old, new = gzip.decompress(spz(made, 3)), spz(made, 4)
     assert new[:15] == old[:4] + b"\x04\0\0\0" + old[8:15]
@@ -114,7 +114,7 @@ def test_the_versions_of_spz_hold_the_same_columns(sh_degree: int) -> None:
 
 
 @pytest.mark.parametrize("sh_degree", [0, 2])
-def test_glb_read_by_the_letter(sh_degree: int, tmp_path: Path) -> None:
+def test_glb_follows_the_specification(sh_degree: int, tmp_path: Path) -> None:
     made = scene(sh_degree)
     write_scene(tmp_path / "a.glb", made, "glb")
     content = (tmp_path / "a.glb").read_bytes()
@@ -182,16 +182,16 @@ def test_usd_read_by_openusd(tmp_path: Path) -> None:
     assert_turned(found, made.gaussians, ABOUT_Z, sh_within=1e-5)
 
 
-def test_a_scene_beyond_the_numbers_of_spz_is_refused() -> None:
-    """Its positions were cut off, and nobody was told."""
+def test_a_scene_too_large_for_spz_is_refused() -> None:
+    """Such positions were once clipped without a warning."""
     made = scene(0)
     made.gaussians.means[3, 1] = 9e6
-    with pytest.raises(InputError, match=r"too large for \.spz"):
+    with pytest.raises(InputError, match=r"\.spz stores at most"):
         spz(made)
 
 
 def test_spz_keeps_positions_far_away(tmp_path: Path) -> None:
-    """24 bits are shared between whole units and their fractions."""
+    """The 24 bits are divided between integer and fraction by the largest coordinate."""
     made = scene(0)
     made.gaussians.means.mul_(3000.0)
     write_scene(tmp_path / "a.spz", made, "spz")
@@ -201,10 +201,10 @@ def test_spz_keeps_positions_far_away(tmp_path: Path) -> None:
     assert np.abs(back.means * ABOUT_X - made.gaussians.means.numpy()).max() < reach / 2**22
 
 
-def test_the_ending_decides() -> None:
+def test_the_file_extension_selects_the_format() -> None:
     assert [format_of(Path(f"A.b.{ending.upper()}")) for ending in FORMATS] == list(FORMATS)
     for name in ("room.splat", "room", "ply", "room.compressed"):
-        with pytest.raises(InputError, match="no ending"):
+        with pytest.raises(InputError, match="not a known scene format"):
             format_of(Path(name))
 
 
@@ -228,7 +228,7 @@ def test_cameras_follow_the_scene() -> None:
     camera = Camera(640, 480, 500.0, 510.0, 320.0, 240.0, pose)
     shift = np.array([4.0, 5.0, 6.0])
     (entry,) = cameras_json([("a.jpg", camera)], scale=2.0, rotation=turn, translation=shift)
-    point = np.array([0.3, -0.4, 2.0])  # seen at the same place, twice as far
+    point = np.array([0.3, -0.4, 2.0])  # at the same pixel, twice as far away
     before = pose[:3, :3] @ point + pose[:3, 3]
     after = np.array(entry["rotation"]).T @ (2.0 * turn @ point + shift - entry["position"])
     assert np.allclose(after, 2.0 * before) and (entry["fx"], entry["img_name"]) == (500.0, "a.jpg")

@@ -47,7 +47,7 @@ CONFIG = G0Config(
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """ingest/ and rva/ of seven frames; only the active ones have an image that can be decoded."""
+    """Folders ingest/ and rva/ of seven frames; only active frames have a valid image."""
     root = tmp_path_factory.mktemp("capture")
     truth = gaussians()
     pictures = images(truth, 7)
@@ -122,7 +122,7 @@ def digests(work: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (work / "out").iterdir()}
 
 
-def test_it_makes_a_scene_from_the_active_frames_alone(capture: Path, tmp_path: Path) -> None:
+def test_only_active_frames_train_the_scene(capture: Path, tmp_path: Path) -> None:
     result = g0.run(context(capture, tmp_path))
     assert {path.name for path in (tmp_path / "out").iterdir()} == set(g0.OUTPUTS)
     rows = read_table(tmp_path / "out" / "train.parquet", TRAIN).to_pylist()
@@ -131,8 +131,8 @@ def test_it_makes_a_scene_from_the_active_frames_alone(capture: Path, tmp_path: 
     summary = dict(result.summary)
     assert summary["gaussians"] == scene.gaussians.num == 120
     assert (summary["gaussians_start"], summary["views"], summary["sh_degree"]) == (100, 4, 0)
-    # Colours and places are right from the start, so a short training explains the strong frames well: a
-    # blank or mirrored scene stays under 15 dB.
+    # Initial colours and positions are correct, so a short training fits the strong frames well. An empty or
+    # mirrored scene stays below 15 dB.
     assert summary["psnr_strong"] > 18.0
     assert not summary["exposure"]
     exposure = read_exposure(tmp_path / "out" / "exposure.parquet")
@@ -170,7 +170,7 @@ def test_exposure_can_be_forced(capture: Path, tmp_path: Path) -> None:
     assert read_exposure(tmp_path / "out" / "exposure.parquet").enabled
 
 
-def test_the_spread_of_exposures_is_told_where_compensation_is_off(capture: Path, tmp_path: Path) -> None:
+def test_exposure_spread_is_reported_without_compensation(capture: Path, tmp_path: Path) -> None:
     off = g0.run(context(capture, tmp_path / "off", CONFIG.model_copy(update={"exposure": "off"})))
     on = g0.run(context(capture, tmp_path / "on", CONFIG.model_copy(update={"exposure": "on"})))
     assert off.summary["exposure_spread"] == on.summary["exposure_spread"] is not None
@@ -195,7 +195,7 @@ def test_no_active_frame_is_an_error(capture: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("budget", [1, 30, 80])
 def test_the_budget_is_a_maximum_from_the_first_step(capture: Path, tmp_path: Path, budget: int) -> None:
-    """Below the sparse points (60), and between them and min_points (100)."""
+    """Budgets below the number of sparse points (60), and between it and min_points (100)."""
     config = CONFIG.model_copy(update={"budget": budget, "steps": 3})
     result = g0.run(context(capture, tmp_path, config))
     summary = dict(result.summary)
@@ -204,7 +204,7 @@ def test_the_budget_is_a_maximum_from_the_first_step(capture: Path, tmp_path: Pa
 
 
 def compiled() -> set[str]:
-    """Kernels of this process, each with the types for which it is compiled or loaded."""
+    """Return the kernels of this process, with the types for which they are compiled or loaded."""
     from numba.core.dispatcher import Dispatcher
 
     modules = [name for name in sys.modules if name.startswith("cleargs.splat.kernels.cpu.")]
@@ -218,7 +218,7 @@ def compiled() -> set[str]:
 
 
 class CompiledWithin(SilentReporter):
-    """A reporter that looks for what is compiled while a task is open."""
+    """Reporter that finds kernels compiled while a task is open."""
 
     def __init__(self) -> None:
         self.before: set[str] = set()
@@ -231,8 +231,8 @@ class CompiledWithin(SilentReporter):
         self.found |= compiled() - self.before
 
 
-def test_nothing_is_compiled_once_the_time_left_is_told(capture: Path, tmp_path: Path) -> None:
-    """In a process of its own, since kernels that another test compiled are there already."""
+def test_kernels_are_compiled_before_the_progress_bar(capture: Path, tmp_path: Path) -> None:
+    """Run in a separate process, because other tests may have compiled kernels in this one."""
     program = (
         "import sys; from dataclasses import replace; from pathlib import Path\n"
         "from test_g0 import CompiledWithin, context, g0\n"

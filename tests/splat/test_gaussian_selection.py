@@ -1,4 +1,4 @@
-"""What is left out of an export: by contribution, by a box."""
+"""Gaussians that an export leaves out: by contribution, or by a box."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ CAMERA = Camera(48, 36, 40.0, 40.0, 24.0, 18.0, np.eye(4))
 def nothing() -> None: ...
 
 
-def test_the_contributions_of_a_picture_make_up_its_alpha() -> None:
-    """Weights sum to 1 - T in every pixel; negative colours and antialiasing do not matter."""
+def test_contributions_sum_to_alpha() -> None:
+    """Weights sum to 1 - T in each pixel, also with negative colours and antialiasing."""
     made = make_scene(60, 4)
-    made.gaussians.sh[:, 0] -= 3.0  # darker than black: the clamp would hide them
+    made.gaussians.sh[:, 0] -= 3.0  # darker than black, so the render clamps them
     for antialias in (False, True):
         scene = Scene(made.gaussians, antialias=antialias)
         total = float(contributions(scene, [CAMERA], nothing).double().sum())
@@ -30,7 +30,7 @@ def test_the_contributions_of_a_picture_make_up_its_alpha() -> None:
         assert alpha > 100 and total == pytest.approx(alpha, rel=1e-4)
 
 
-def test_the_best_view_counts_and_what_is_hidden_counts_little() -> None:
+def test_contribution_is_that_of_the_best_view() -> None:
     gaussians = Gaussians(
         means=torch.tensor([[0.0, 0, 2], [0.0, 0, 4], [0.0, 0, -2]]),
         log_scales=torch.full((3, 3), -1.5),
@@ -38,8 +38,8 @@ def test_the_best_view_counts_and_what_is_hidden_counts_little() -> None:
         logit_opacities=torch.full((3,), 6.0),
         sh=torch.zeros(3, 1, 3),
     )
-    # The far one shows around the rim of the near one, where that is transparent.
-    back = np.diag([-1.0, 1, -1, 1])  # turned about y: sees the third alone
+    # The far Gaussian is visible through the transparent rim of the near one.
+    back = np.diag([-1.0, 1, -1, 1])  # rotated about y, so it sees only the third
     ahead = contributions(Scene(gaussians), [CAMERA], nothing)
     assert ahead[0] > 50 and 0 < ahead[1] < ahead[0] / 10 and ahead[2] == 0
     turned = Camera(48, 36, 40.0, 40.0, 24.0, 18.0, back)

@@ -1,4 +1,4 @@
-"""How fast this machine is: measured where asked for, and remembered."""
+"""The pace of this machine: measurement and cache."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ Results = list[float | None]
 
 @pytest.fixture
 def results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Results:
-    """What the next measurements give; the cache is empty."""
+    """Results of the next measurements; the cache is empty."""
     waiting: Results = []
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(pace, "_measured", lambda: waiting.pop(0))
+    monkeypatch.setattr(pace, "_measure_in_subprocess", lambda: waiting.pop(0))
     return waiting
 
 
 def nobody(text: str) -> None: ...
 
 
-def test_nothing_is_measured_unless_somebody_is_told(results: Results) -> None:
+def test_nothing_is_measured_without_a_message(results: Results) -> None:
     assert machine_pace() == 1.0 and cached_pace() is None
 
 
-def test_it_is_measured_once(results: Results) -> None:
+def test_pace_is_measured_once(results: Results) -> None:
     said: list[str] = []
     results.append(1.5 * REFERENCE_MS)
     assert machine_pace(said.append) == 1.5 and len(said) == 1
     assert machine_pace(said.append) == machine_pace() == cached_pace() == 1.5
-    assert len(said) == 1, "a second measurement would have found nothing to give"
+    assert len(said) == 1, "there is no result for a second measurement"
 
 
 @pytest.mark.parametrize("change", ["processor", "host", "probe"])
-def test_another_machine_is_measured_anew(
+def test_another_machine_is_measured_again(
     results: Results, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     results += [REFERENCE_MS, 2.0 * REFERENCE_MS]
@@ -51,7 +51,7 @@ def test_another_machine_is_measured_anew(
             other.setattr(pace, "PROBE", pace.PROBE + 1)
         assert machine_pace() == 1.0
         assert machine_pace(nobody) == 2.0
-    assert cached_pace() == 1.0, "both are kept"
+    assert cached_pace() == 1.0, "the cache keeps both"
 
 
 @pytest.mark.parametrize(
@@ -63,30 +63,30 @@ def test_another_machine_is_measured_anew(
         *(f'{{"milliseconds": {text}}}' for text in ('"x"', "0", "-3.0", "NaN", "Infinity", "null")),
     ],
 )
-def test_a_damaged_note_is_no_note(results: Results, content: str) -> None:
+def test_a_damaged_cache_file_is_ignored(results: Results, content: str) -> None:
     results += [REFERENCE_MS, 3.0 * REFERENCE_MS]
     machine_pace(nobody)
-    pace._note().write_text(content)
+    pace._cache_file().write_text(content)
     assert cached_pace() is None and machine_pace() == 1.0
     assert machine_pace(nobody) == cached_pace() == 3.0
 
 
-def test_what_cannot_be_measured_is_taken_for_the_reference(results: Results) -> None:
+def test_a_failed_measurement_gives_the_reference_pace(results: Results) -> None:
     results += [None, 2.0 * REFERENCE_MS]
     assert machine_pace(nobody) == 1.0
-    assert machine_pace(nobody) == 2.0, "and tried again"
+    assert machine_pace(nobody) == 2.0, "measured again"
 
 
-def test_a_probe_that_fails_gives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_measurement_returns_none(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("cleargs.no_such_module", "cleargs.splat"):
         monkeypatch.setattr(pace, "module_command", lambda _, module=module: ["python", "-m", module])
-        assert pace._measured() is None
+        assert pace._measure_in_subprocess() is None
     monkeypatch.setattr(pace, "module_command", lambda _: ["/no/such/program"])
-    assert pace._measured() is None
+    assert pace._measure_in_subprocess() is None
     monkeypatch.setattr(pace, "module_command", lambda _: ["echo", "hello"])
-    assert pace._measured() is None
+    assert pace._measure_in_subprocess() is None
 
 
-def test_the_probe_measures() -> None:
-    milliseconds = pace._measured()
+def test_the_subprocess_measures() -> None:
+    milliseconds = pace._measure_in_subprocess()
     assert milliseconds is not None and milliseconds > 0.0

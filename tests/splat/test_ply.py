@@ -1,4 +1,4 @@
-"""``scene.ply``: what other programs read, and what we read back."""
+"""``scene.ply``, read by plyfile and by ClearGS."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def scene(sh_degree: int, count: int = 5) -> Scene:
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_others_read_it_in_the_inria_layout(sh_degree: int, tmp_path: Path) -> None:
+def test_plyfile_reads_the_inria_layout(sh_degree: int, tmp_path: Path) -> None:
     made = scene(sh_degree)
     write_ply(tmp_path / "scene.ply", made)
     ply = PlyData.read(str(tmp_path / "scene.ply"))

@@ -1,4 +1,4 @@
-"""Learning rates: those of a long training, faster in a short one, and falling."""
+"""Learning rates: factors for short trainings, and decay."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_short_training_learns_faster() -> None:
     assert rates(TrainConfig(steps=100, rate_factor=1.0), 0) == pytest.approx(long)
 
 
-def test_rates_fall_to_the_share_that_is_asked_for() -> None:
+def test_rates_decay_to_the_configured_fraction() -> None:
     config = TrainConfig(steps=1000)
     first, last = rates(config, 0), rates(config, 1000)
     for name in GROUPS:
@@ -42,8 +42,8 @@ def test_rates_fall_to_the_share_that_is_asked_for() -> None:
         assert rates(config, 500)[name] == pytest.approx(first[name] * share**0.5), name
 
 
-def test_a_distillation_goes_on_where_the_first_scene_ends() -> None:
-    """One schedule for the whole method: G0, two rounds and the consolidation are its parts."""
+def test_distillation_continues_the_schedule_of_g0() -> None:
+    """G0, two rounds and the consolidation are parts of one schedule."""
     whole = TrainConfig(steps=950)
     g0, rivr = G0Config(steps=800), RivrConfig(distil=RoundsConfig(steps=50))
     parts = (

@@ -1,4 +1,4 @@
-"""Densification: what is cut looks as before, budgets hold, noise goes where it should."""
+"""Densification: splits preserve the render, growth has a budget, and noise moves transparent Gaussians."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def arrays(count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
 def refined(
     made: dict[str, np.ndarray], errors: np.ndarray, *, rate: float = 0.05, budget: int = 1000
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The arrays after a refinement, and their moments, which were 1."""
+    """Return arrays after a refinement, and their moments, which were 1 before."""
     grown, (moments,) = refine(
         made,
         [{name: np.ones_like(array) for name, array in made.items()}],
@@ -48,14 +48,14 @@ def refined(
     return grown, moments
 
 
-def test_the_dead_become_halves_of_what_takes_part_in_errors() -> None:
+def test_dead_gaussians_become_halves_of_those_with_errors() -> None:
     made = arrays(50, np.random.default_rng(0))
     dead = [3, 7, 49]
     made["logit_opacities"][dead] = -9.0
     made["logit_opacities"][7] = np.nan
     before = {name: array.copy() for name, array in made.items()}
     errors = np.zeros(50)
-    errors[[*dead, 10, 20, 30]] = 1.0  # that of the dead is nobody's
+    errors[[*dead, 10, 20, 30]] = 1.0  # errors of dead Gaussians do not count
     grown, moments = refined(made, errors, rate=0.0)
     touched = [*dead, 10, 20, 30]
     same = np.setdiff1d(np.arange(50), touched)
@@ -68,13 +68,13 @@ def test_the_dead_become_halves_of_what_takes_part_in_errors() -> None:
     assert (grown["logit_opacities"][[10, 20, 30]] < before["logit_opacities"][[10, 20, 30]]).all()
 
 
-@pytest.mark.parametrize("nobody", ["is alive", "takes part in errors"])
-def test_nothing_is_changed_where_nobody(nobody: str) -> None:
+@pytest.mark.parametrize("condition", ["is alive", "has errors"])
+def test_nothing_changes_if_no_gaussian(condition: str) -> None:
     made = arrays(4, np.random.default_rng(0))
-    if nobody == "is alive":
+    if condition == "is alive":
         made["logit_opacities"][:] = -20.0
     before = made["means"].copy()
-    grown, moments = refined(made, np.full(4, float(nobody == "is alive")), rate=1.0)
+    grown, moments = refined(made, np.full(4, float(condition == "is alive")), rate=1.0)
     assert np.array_equal(grown["means"], before) and (moments["means"] == 1).all()
 
 
@@ -89,8 +89,8 @@ def test_growth_stops_at_the_budget(budget: int, expected: int) -> None:
     assert all(array.dtype == np.float32 and array.flags.c_contiguous for array in grown.values())
 
 
-def test_what_has_most_of_the_error_is_cut_again_and_again() -> None:
-    """One with all of the error is two after the first round, four after the second, sixteen in the end."""
+def test_a_gaussian_with_a_large_error_is_split_repeatedly() -> None:
+    """A Gaussian with all of the error becomes 2 after the first round, 4 after the second, 16 at the end."""
     made = arrays(200, np.random.default_rng(0))
     made["log_scales"][5] = 1.0
     before = {name: array.copy() for name, array in made.items()}
@@ -99,7 +99,7 @@ def test_what_has_most_of_the_error_is_cut_again_and_again() -> None:
     parts = np.flatnonzero((grown["sh"] == before["sh"][5]).all(axis=(1, 2)))
     assert len(parts) == 16 and 5 in parts
     np.testing.assert_allclose(grown["means"][parts].mean(axis=0), before["means"][5], atol=1e-4)
-    assert np.exp(grown["log_scales"][parts]).prod(axis=1).max() < 0.3 * np.exp(3.0)  # of its volume
+    assert np.exp(grown["log_scales"][parts]).prod(axis=1).max() < 0.3 * np.exp(3.0)  # the volume
 
 
 @given(opacity=st.floats(0.02, 0.99), seed=st.integers(0, 99))
@@ -108,13 +108,13 @@ def test_two_halves_look_like_the_whole(opacity: float, seed: int) -> None:
     made["logit_opacities"][0] = np.log(opacity / (1 - opacity))
     whole = {name: array[0].astype(np.float64) for name, array in made.items()}
     grown, _ = refined(made, np.ones(1), rate=1.0)
-    # They lie on either side of it, along its longest axis.
+    # The halves are on opposite sides of the centre, along the longest axis.
     np.testing.assert_allclose(grown["means"].mean(axis=0), whole["means"], atol=1e-6)
     longest = whole["log_scales"].argmax()
     axis = rotation_matrices(whole["rotations"][None].astype(np.float32))[0][:, longest]
     apart = grown["means"][1] - grown["means"][0]
     assert abs(apart @ axis) == pytest.approx(np.linalg.norm(apart), rel=1e-4)
-    # Along that axis, in units of its scale: mass and spread of the optical depth stay, within 5 %.
+    # Mass and variance of the optical depth along that axis are preserved within 5 %. Units: its scale.
     x = np.linspace(-6, 6, 2001)
     place = np.linalg.norm(apart) / 2 / np.exp(whole["log_scales"][longest])
     scales = np.exp(grown["log_scales"][:, longest] - whole["log_scales"][longest])
@@ -131,7 +131,7 @@ def test_samples_follow_the_weights() -> None:
     first = np.array([sample_once(weights, 1, rng)[0] for _ in range(10_000)])
     counts = np.bincount(first, minlength=4)
     assert counts[0] == counts[3] == 0
-    # Standard deviation of the count is sqrt(10000 * 1/4 * 3/4) = 43; five of them.
+    # The standard deviation of the count is sqrt(10000 * 1/4 * 3/4) = 43; the limit is five of them.
     assert abs(counts[1] - 2_500) < 217
     assert set(sample_once(weights, 2, rng)) == {1, 2}
 
@@ -140,7 +140,7 @@ COUNT = 20_000
 
 
 def noise(seed: int = 11, *, opacity: float = OPEN, threads: int = 2) -> np.ndarray:
-    """What a step adds to the means [COUNT, 3] of equal Gaussians, the first hundred of them opaque."""
+    """Return the noise on the means [COUNT, 3] of equal Gaussians, of which the first 100 are opaque."""
     opacities = torch.full((COUNT,), float(np.log(opacity / (1 - opacity))))
     opacities[:100] = 3.0
     many = Gaussians(
@@ -159,22 +159,22 @@ SCALES = [0.1, 0.02, 0.01]
 QUATERNION = np.float32([0.9, 0.1, -0.3, 0.2]) * 3
 
 
-def test_noise_is_the_covariance_times_normal_where_transparent() -> None:
-    offsets = noise()  # the sigmoid fades to exactly a half
+def test_noise_of_transparent_gaussians_has_their_covariance() -> None:
+    offsets = noise()  # the factor of the noise is exactly 1/2
     assert not offsets[:100].any() and offsets[100:].any(axis=1).all()
     matrix = rotation_matrices(QUATERNION[None])[0].astype(np.float64)
     covariance = matrix @ np.diag(np.square(SCALES)) @ matrix.T
     draws = offsets[100:] @ np.linalg.inv(covariance)  # amount * fade = 1
-    # 19,900 draws: means and correlations are good to 0.007, deviations to 0.005, and the share within one
-    # standard deviation (68.27 %) to 0.0033; four of them.
+    # 19,900 draws: the standard errors are 0.007 for means and correlations, 0.005 for deviations, and 0.0033
+    # for the share within one standard deviation (68.27 %). The limits are four standard errors.
     np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=0.03)
     np.testing.assert_allclose(np.cov(draws.T), np.eye(3), atol=0.04)
     np.testing.assert_allclose((np.abs(draws) < 1).mean(axis=0), 0.6827, atol=0.014)
 
 
-def test_noise_fades_out_with_opacity_and_no_draw_comes_twice() -> None:
+def test_noise_fades_with_opacity_and_never_repeats() -> None:
     faint, half = noise(opacity=OPEN), noise(opacity=0.05)
-    # sigmoid(-4.5) over sigmoid(0); the logit of single precision moves it by some 1e-5.
+    # The ratio is sigmoid(-4.5) / sigmoid(0). Rounding of the logit to float32 changes it by about 1e-5.
     np.testing.assert_allclose(half, faint / (0.5 * (1 + np.exp(4.5))), rtol=1e-4, atol=1e-12)
     assert not noise(opacity=0.2).any()
     drawn = np.concatenate([faint[100:], noise(seed=12)[100:]])

@@ -1,4 +1,4 @@
-"""Training: weights, masks, kinds of views, resumption, threads, errors."""
+"""The trainer: weights, masks, kinds of views, resumption, threads and errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ CONFIG = TrainConfig(
 
 
 class Listener(SilentReporter):
-    """Keeps warnings."""
+    """Reporter that stores warnings."""
 
     def __init__(self) -> None:
         self.warnings: list[str] = []
@@ -71,7 +71,7 @@ def run(pictures_or_views: Any, folder: Path, config: TrainConfig = CONFIG, **op
 
 
 def affines(weights: list[float] | None = None, rate: float = CONFIG.lr_exposure) -> CaptureFormation:
-    """A colour affine for each of six frames, and no motion."""
+    """Exposure compensation of six frames, without motion."""
     seen = views([np.empty(0)] * 6, weights=weights)
     return CaptureFormation(
         seen, FormationConfig(enabled=False), exposure=Exposure.identity(range(6)), lr_exposure=rate
@@ -85,12 +85,12 @@ def assert_same(first: Trained, second: Trained) -> None:
         assert torch.equal(tensor, second.state[name]), name
 
 
-def test_it_learns_the_pictures(pictures: list[np.ndarray], tmp_path: Path) -> None:
+def test_training_reduces_the_error(pictures: list[np.ndarray], tmp_path: Path) -> None:
     before = evaluate_views(start(sh_degree=1), views(pictures))
     trained = run(pictures, tmp_path, CONFIG.model_copy(update={"steps": 200, "refine_every": 5 / 200}))
     after = evaluate_views(trained.scene, views(pictures))
-    # Random blobs start near 12 dB; 200 steps gain far more than 5 dB, an optimiser that ignores one of its
-    # groups still gains some, one with a wrong sign loses.
+    # Random blobs start near 12 dB. 200 steps gain far more than 5 dB. An optimiser that ignores one
+    # parameter gains less, and one with a wrong sign loses.
     gain = np.mean([fit.psnr for fit in after]) - np.mean([fit.psnr for fit in before])
     assert gain > 5.0
     assert trained.scene.gaussians.num == 80
@@ -104,11 +104,11 @@ def test_it_learns_the_pictures(pictures: list[np.ndarray], tmp_path: Path) -> N
     assert set(rows.column("frame_id").to_pylist()) == set(range(6))
 
 
-def test_a_schedule_in_parts_is_the_schedule(pictures: list[np.ndarray], tmp_path: Path) -> None:
-    """Rates, growth, SH degree, image size, noise and Adam's steps go on where the part before has ended."""
-    one = views(pictures[:1])  # each part draws the views in an order of its own
+def test_a_schedule_in_parts_equals_the_whole(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    """Rates, growth, SH degree, image size, noise and steps of Adam continue from the part before."""
+    one = views(pictures[:1])  # each part has a different order of views
     whole = run(one, tmp_path / "whole")
-    ends = (0.0, 0.2, 0.75, 1.0)  # none in the steps that look for errors, which a part forgets
+    ends = (0.0, 0.2, 0.75, 1.0)  # not within steps that measure errors, which a part does not hand over
     scene, moments, rows = start(sh_degree=1), None, []
     for number, (begin, end) in enumerate(pairwise(ends)):
         part = CONFIG.model_copy(update={"steps": round(40 * (end - begin)), "begin": begin, "end": end})
@@ -118,9 +118,9 @@ def test_a_schedule_in_parts_is_the_schedule(pictures: list[np.ndarray], tmp_pat
         rows += done.rows.to_pylist()
     for name, tensor in whole.scene.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(scene.gaussians, name)), name
-    told = ("loss", "n_gaussians", "sh_degree", "width")
-    assert [[row[name] for name in told] for row in rows] == [
-        [row[name] for name in told] for row in whole.rows.to_pylist()
+    columns = ("loss", "n_gaussians", "sh_degree", "width")
+    assert [[row[name] for name in columns] for row in rows] == [
+        [row[name] for name in columns] for row in whole.rows.to_pylist()
     ]
 
 
@@ -129,15 +129,15 @@ def test_moments_of_another_scene_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="cannot read"):
         read_moments(path, start().gaussians)
     save_state(path, {"step": torch.tensor(0)})
-    with pytest.raises(StoreError, match="not of the scene"):
+    with pytest.raises(StoreError, match="do not fit the scene"):
         read_moments(path, start().gaussians)
     save_state(path, Moments.zeros(start(59).gaussians).state())
-    with pytest.raises(StoreError, match="not of the scene"):
+    with pytest.raises(StoreError, match="do not fit the scene"):
         read_moments(path, start().gaussians)
 
 
 def test_a_part_ends_after_its_begin() -> None:
-    with pytest.raises(ValueError, match="cannot end at"):
+    with pytest.raises(ValueError, match="must be greater than begin"):
         TrainConfig(begin=0.9, end=0.9)
 
 
@@ -165,10 +165,10 @@ def test_a_weight_multiplies_the_loss(pictures: list[np.ndarray], tmp_path: Path
     first, second = full.rows(0).to_pylist()[0], half.rows(0).to_pylist()[0]
     assert second["loss"] == pytest.approx(0.5 * first["loss"], rel=1e-12)
     assert second["l1"] == first["l1"]
-    # The first moment after one step is a tenth of the gradient, so it shows the weight on the gradient.
-    slopes = [trainer.state()["first.sh"].numpy() for trainer in (full, half)]
-    np.testing.assert_allclose(slopes[1], 0.5 * slopes[0], rtol=1e-4, atol=1e-9)
-    assert np.abs(slopes[0]).max() > 0
+    # The first moment after one step is a tenth of the gradient, so it is proportional to the weight.
+    moments = [trainer.state()["first.sh"].numpy() for trainer in (full, half)]
+    np.testing.assert_allclose(moments[1], 0.5 * moments[0], rtol=1e-4, atol=1e-9)
+    assert np.abs(moments[0]).max() > 0
 
 
 def test_weight_zero_is_never_decoded(pictures: list[np.ndarray], tmp_path: Path) -> None:
@@ -190,13 +190,13 @@ def test_masked_pixels_contribute_nothing(pictures: list[np.ndarray], tmp_path: 
             painted = picture.copy()
             painted[~mask] = value
             made.append(replace(view, load=keep(painted, mask)))
-        # Reduced images mix neighbours; a reduced pixel counts only when no ignored one lies under it.
+        # Reduced images mix neighbours. A reduced pixel counts only if it covers no masked pixel.
         results.append(run(made, tmp_path / str(index)))
     assert_same(*results)
 
 
 LOOKING = CONFIG.model_copy(update={"refine_every": 16 / 40})
-"""Refined after 16 and 32 steps; the errors of the two steps before count."""
+"""Refinements after 16 and 32 steps, each with the errors of the two steps before."""
 
 
 def looking(scene: Scene, pictures: list[np.ndarray]) -> Trainer:
@@ -206,8 +206,8 @@ def looking(scene: Scene, pictures: list[np.ndarray]) -> Trainer:
     return trainer
 
 
-def test_an_error_is_charged_to_the_gaussians_that_take_part_in_it(pictures: list[np.ndarray]) -> None:
-    """Where growth looks: one Gaussian of the truth has the wrong colour, and no rate to change it."""
+def test_errors_go_to_the_gaussians_that_cause_them(pictures: list[np.ndarray]) -> None:
+    """One Gaussian of the true scene has the wrong colour, and a rate of 0."""
     wrong = gaussians()
     still = LOOKING.model_copy(
         update={f"lr_{name}": 0.0 for name in ("means", "scales", "rotations", "opacities", "sh")}
@@ -224,11 +224,11 @@ def test_an_error_is_charged_to_the_gaussians_that_take_part_in_it(pictures: lis
     wrong.sh[shown] *= -1.0
     errors = charged(wrong)
     assert errors.argmax() == shown
-    # What is left in the truth is that pictures are stored in whole steps of 1/255.
+    # The true scene has a small error, because images are stored in steps of 1/255.
     assert hidden.sum() < 0.01 * errors.sum()
 
 
-def test_resumed_amid_looks_equals_undisturbed(pictures: list[np.ndarray]) -> None:
+def test_resuming_with_pending_errors_changes_no_bit(pictures: list[np.ndarray]) -> None:
     whole = looking(start(), pictures)
     saved = {name: tensor.clone() for name, tensor in whole.state().items()}
     assert "strategy.errors" in saved
@@ -242,7 +242,7 @@ def test_resumed_amid_looks_equals_undisturbed(pictures: list[np.ndarray]) -> No
         assert torch.equal(tensor, resumed.scene.gaussians.tensors()[name]), name
 
 
-def test_resumed_equals_undisturbed(
+def test_resuming_changes_no_bit(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = run(pictures, tmp_path / "whole", formation=affines())
@@ -266,7 +266,7 @@ def test_resumed_equals_undisturbed(
 def test_sigterm_leads_to_a_checkpoint(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Step 10 is no multiple of the interval: the checkpoint is there because of the signal."""
+    """Step 10 is not a multiple of the interval, so the signal caused the checkpoint."""
     whole = run(pictures, tmp_path / "whole")
     take = Trainer.step
 
@@ -310,7 +310,7 @@ def test_a_checkpoint_of_another_training_is_ignored(pictures: list[np.ndarray],
 
 
 @pytest.mark.parametrize("changed", ["pose", "background"])
-def test_so_is_one_of_other_cameras_or_another_background(
+def test_a_checkpoint_of_another_capture_is_ignored(
     changed: str, pictures: list[np.ndarray], tmp_path: Path
 ) -> None:
     run(pictures, tmp_path)
@@ -326,10 +326,8 @@ def test_so_is_one_of_other_cameras_or_another_background(
     assert "another" in listener.warnings[0]
 
 
-def test_a_frame_without_a_pixel_that_counts_spoils_no_mean(
-    pictures: list[np.ndarray], tmp_path: Path
-) -> None:
-    """Its PSNR is infinite; such frames are real: whole frames can be masked."""
+def test_fully_masked_frames_do_not_affect_the_mean_psnr(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    """The PSNR of a fully masked frame is infinite; masks of real captures can cover whole frames."""
     seen = views(pictures)
     nothing = np.zeros((HEIGHT, WIDTH), bool)
     seen[0] = replace(seen[0], load=lambda: (pictures[0], nothing))
@@ -367,10 +365,8 @@ def test_the_cache_changes_no_bit(pictures: list[np.ndarray], tmp_path: Path) ->
         assert len(calls) == expected
 
 
-def test_some_pixels_of_every_frame_teach_nothing_and_tell_how_good_the_scene_is(
-    pictures: list[np.ndarray], tmp_path: Path
-) -> None:
-    """Whatever they show, the scene is the same; only the figure that is taken of them is not."""
+def test_unseen_pixels_measure_quality_without_training(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    """Different unseen pixels give the same scene, but another PSNR of these pixels."""
     painted = []
     for frame_id, picture in enumerate(pictures):
         changed = picture.copy()
@@ -387,11 +383,11 @@ def test_some_pixels_of_every_frame_teach_nothing_and_tell_how_good_the_scene_is
     assert pooled_unseen([Fit(20.0, None)]) is None
 
 
-def test_a_hundredth_of_every_frame_is_not_seen() -> None:
+def test_one_percent_of_each_frame_is_unseen() -> None:
     masks = [unseen_pixels(frame_id, 540, 960) for frame_id in range(20)]
     assert {int(mask.sum()) for mask in masks} == {12 * 7 * 64}
     assert np.mean(masks) == pytest.approx(0.01, rel=0.05)
-    # Frames leave out different places: of 20 masks few have a pixel in common, and each is the same again.
+    # Masks differ between frames: few of 20 masks share a pixel. Each mask is reproducible.
     assert np.sum(masks, axis=0).max() <= 6
     assert np.array_equal(masks[3], unseen_pixels(3, 540, 960))
     assert not unseen_pixels(0, 15, 400).any()
@@ -408,7 +404,7 @@ def test_pseudo_views_get_their_share_and_weight(pictures: list[np.ndarray], tmp
     assert {row["weight"] for row in rows if row["kind"] == "real"} == {1.0}
     assert {row["frame_id"] for row in rows if row["kind"] == "pseudo"} == {0, 1}
     assert {row["round"] for row in rows} == {3}
-    # Every epoch of 6 real views shows each of them once.
+    # Each epoch of 6 real views uses each of them once.
     real = [row["frame_id"] for row in rows if row["kind"] == "real"]
     assert sorted(real[:6]) == sorted(real[6:12]) == list(range(6))
     assert real[:6] != real[6:12]
@@ -420,7 +416,7 @@ def test_without_densification_the_number_stays(pictures: list[np.ndarray], tmp_
     assert trained.scene.gaussians.num == 60
 
 
-def test_the_given_scene_is_left_alone(pictures: list[np.ndarray], tmp_path: Path) -> None:
+def test_the_initial_scene_is_not_changed(pictures: list[np.ndarray], tmp_path: Path) -> None:
     scene = start()
     before = scene.gaussians.clone()
     run(pictures, tmp_path, scene=scene)
@@ -428,13 +424,13 @@ def test_the_given_scene_is_left_alone(pictures: list[np.ndarray], tmp_path: Pat
         assert torch.equal(tensor, before.tensors()[name]), name
 
 
-def test_not_a_number_names_step_and_group(pictures: list[np.ndarray], tmp_path: Path) -> None:
+def test_nan_errors_name_step_and_parameter(pictures: list[np.ndarray], tmp_path: Path) -> None:
     with pytest.raises(StageError, match=r"log_scales.* step \d+"):
         run(pictures, tmp_path, CONFIG.model_copy(update={"lr_scales": math.inf}))
 
 
 def poison(monkeypatch: pytest.MonkeyPatch, after: int, change: Callable[[Trainer], None]) -> None:
-    """Have every training damaged once ``after`` steps are done."""
+    """Damage every training after ``after`` steps."""
     step = Trainer.step
 
     def damaged(trainer: Trainer) -> None:
@@ -447,11 +443,11 @@ def poison(monkeypatch: pytest.MonkeyPatch, after: int, change: Callable[[Traine
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["means", "log_scales", "rotations", "logit_opacities", "sh"])
-def test_the_last_good_checkpoint_survives_not_a_number(
+def test_the_last_good_checkpoint_survives_nan(
     name: str, value: float, pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     poison(monkeypatch, 16, lambda trainer: trainer.scene.gaussians.tensors()[name][3].fill_(value))
-    # Found at step 20, long before the next checkpoint and the end, as no step is worth much after it.
+    # The fault is found at step 20, long before the next checkpoint and the end.
     config = CONFIG.model_copy(update={"steps": 60, "checkpoint_interval": 14, "refine_every": 1.0})
     with pytest.raises(StageError, match=rf"{name} is not finite in 1 of 60 Gaussians at step 20") as raised:
         run(pictures, tmp_path, config)
@@ -462,10 +458,10 @@ def test_the_last_good_checkpoint_survives_not_a_number(
     assert all(torch.isfinite(tensor.float()).all() for name, tensor in saved.items() if name != "log")
 
 
-def test_a_preview_beside_the_checkpoint_changes_no_bit(
+def test_previews_change_no_bit(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is the view of the largest weight, as the scene at the checkpoint shows it."""
+    """A preview is a render of the scene at the checkpoint, from the view with the largest weight."""
     weighted = views(pictures, weights=[0.5, 0.5, 0.9, 0.5, 0.5, 0.5])
     with_previews = run(weighted, tmp_path / "a")
     shown = read_rgb(tmp_path / "a" / PREVIEW)
@@ -480,18 +476,18 @@ def test_a_preview_beside_the_checkpoint_changes_no_bit(
     assert_same(with_previews, run(weighted, tmp_path / "b"))
 
 
-def test_relocation_does_not_hide_not_a_number(
+def test_relocation_does_not_hide_nan(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def damage(trainer: Trainer) -> None:
         trainer.scene.gaussians.logit_opacities[3] = math.nan
 
-    poison(monkeypatch, 14, damage)  # taken for dead at step 15, it would be made anew from another
+    poison(monkeypatch, 14, damage)  # a refinement at step 15 would treat it as dead, and replace it
     with pytest.raises(StageError, match=r"logit_opacities is not finite in 1 of .* at step 15"):
         run(pictures, tmp_path, CONFIG.model_copy(update={"checkpoint_interval": 50}))
 
 
-def test_an_exposure_that_is_not_finite_reaches_no_checkpoint(
+def test_infinite_exposure_is_not_saved(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def damage(trainer: Trainer) -> None:
@@ -531,7 +527,7 @@ def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: P
     settled = centred(exposure.affines, np.array(weights))
     np.testing.assert_allclose(exposure.affines, settled, atol=1e-12)
     grey = [float((exposure.of(frame) @ [0.5, 0.5, 0.5, 1.0]).mean()) for frame in range(6)]
-    # The truth is a ratio of 0.8 between the halves; half of the way is asserted, noise would be near 1.
+    # The true ratio of the halves is 0.8. The test asserts half of the way; noise would give about 1.
     assert np.mean(grey[3:]) / np.mean(grey[:3]) < 0.9
     bright, dark = (render_observed(trained.scene, views(darker)[i], exposure) for i in (0, 3))
     assert bright.mean() > dark.mean()

@@ -1,4 +1,4 @@
-"""Captures as a whole: what their name says, exact truth beside them, equal bytes for equal seeds."""
+"""Whole captures: the faults of their protocol, exact ground truth, equal bytes for equal seeds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cleargs.synth import raycast
 from cleargs.synth.optics import Lens
 from cleargs.synth.path import look_at
 from cleargs.synth.protocols import PROTOCOLS
-from cleargs.synth.raycast import RoomWorld, room_setting
+from cleargs.synth.raycast import RoomWorld, room_setup
 from cleargs.synth.room import DEPTH, SPHERE, Room, make_room
 from cleargs.synth.synthetic_capture import make_capture
 
@@ -56,12 +56,12 @@ def sharpness(path: Path) -> float:
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One of each protocol, of the same room and walk."""
+    """One capture per protocol, of the same room and walk."""
     folder = tmp_path_factory.mktemp("synth")
     return {name: make(folder / name, name, frames=8, seed=1) for name in PROTOCOLS}
 
 
-def test_equal_seeds_give_equal_bytes_and_others_do_not(captures: dict[str, Path], tmp_path: Path) -> None:
+def test_only_equal_seeds_give_equal_bytes(captures: dict[str, Path], tmp_path: Path) -> None:
     again = make(tmp_path / "a", "mixed", frames=8, seed=1)
     assert files(again) == files(captures["mixed"])
     other = make(tmp_path / "b", "mixed", frames=8, seed=2)
@@ -75,7 +75,7 @@ def test_depth_and_position_of_a_ball_are_exact() -> None:
     room = Room(np.concatenate([room.primitives[:1], ball]), room.textures, room.light, room.focus)
     pose = look_at(np.array([0.0, 1.2, 1.5]), np.array([0.0, 1.2, -1.0]))
     depth = RoomWorld(room).depth(pose, Lens(41, 41, 100.0, 100.0, 20.5, 20.5))
-    # Straight ahead the back wall; the ball's axis is 0.3 m to the right at 2.5 m: 12 px beside the centre.
+    # The back wall is straight ahead. The ball is 0.3 m to the right at 2.5 m: 12 px from the centre.
     assert depth[20, 20] == pytest.approx(1.5 + DEPTH / 2, abs=1e-9)
     ray = np.array([0.12, 0, 1]) / np.hypot(0.12, 1)
     to_ball = np.array([0.3, 0, 2.5])
@@ -88,7 +88,7 @@ def test_the_camera_looks_about_the_focus(captures: dict[str, Path]) -> None:
     focus = make_room(1).focus
     for camera_to_world in poses(captures["sharp"]):
         local = camera_to_world[:3, :3].T @ (focus - camera_to_world[:3, 3])
-        # OpenGL axes: ahead is -z; a swing moves the aim by up to 5 degrees, two in a row or tremor by more.
+        # OpenGL axes: -z is forward. A swing turns the camera by up to 5 degrees, two swings by more.
         assert local[2] < 0 and np.hypot(local[0], local[1]) < np.tan(np.radians(10)) * -local[2]
 
 
@@ -107,32 +107,32 @@ def test_the_true_means_are_those_of_the_protocol(captures: dict[str, Path], nam
         assert sum(row["defocus_px"] > 0 for row in rows) == 1
         assert sum(abs(row["exposure_ev"]) > 1.1 for row in rows) == 1
         return
-    # The solver stops at 1e-7 s, at walking speed far below a thousandth of a pixel.
+    # The solver's tolerance is 1e-7 s: at walking speed far below a thousandth of a pixel.
     if protocol.shutter:
         assert [row["shutter_share"] for row in rows] == pytest.approx([protocol.shutter] * len(rows))
     else:
         assert np.mean(blur) == pytest.approx(protocol.blur * scale, abs=1e-3)
     assert np.mean(skew) == pytest.approx(protocol.skew * scale, abs=1e-3)
-    if protocol.blur:  # one exposure for all: the walk alone makes frames differ
+    if protocol.blur:  # one exposure time for all frames: only the speed of the walk differs
         assert len({row["exposure_s"] for row in rows}) == 1
         assert max(blur) > 2 * min(blur)
 
 
-def test_blurred_frames_lose_detail_and_sharp_ones_keep_it(captures: dict[str, Path]) -> None:
+def test_only_blurred_frames_lose_detail(captures: dict[str, Path]) -> None:
     def kept(name: str, row: dict[str, Any]) -> float:
         sharp = captures[name] / "truth" / "observed" / "images" / f"{Path(row['image']).stem}.png"
         return sharpness(captures[name] / row["image"]) / sharpness(sharp)
 
     severe = [kept("gs2e-severe", row) for row in truth(captures["gs2e-severe"]) if row["blur_px"] > 3]
-    # A path of 3 px removes most detail of one direction and next to none of the other (half of the variance
-    # stays), and noise adds some (below 0.2, as the sharp ones show).
+    # A path of 3 px removes most detail in one direction and almost none in the other, so that half of the
+    # variance is left. Noise adds some (below 0.2, as in the sharp frames).
     assert severe and max(severe) < 0.7
-    # Noise and JPEG add detail of their own.
+    # Noise and JPEG also add detail.
     assert all(0.8 < kept("sharp", row) < 1.3 for row in truth(captures["sharp"]))
     assert all(0.8 < kept("gsotm-rs", row) < 1.3 for row in truth(captures["gsotm-rs"]))
 
 
-def test_pose_noise_spoils_the_given_poses_alone(captures: dict[str, Path]) -> None:
+def test_pose_noise_changes_only_the_given_poses(captures: dict[str, Path]) -> None:
     noisy, sharp = captures["gsotm-pn"], captures["sharp"]
     same = {
         name: data for name, data in files(sharp).items() if name.startswith(("images", "truth/observed"))
@@ -145,23 +145,23 @@ def test_pose_noise_spoils_the_given_poses_alone(captures: dict[str, Path]) -> N
         degrees=True
     )
     shifts = given[:, :3, 3] - exact[:, :3, 3]
-    # The root mean square of 24 draws deviates by 1 / sqrt(48) = 14 %; three deviations.
+    # The root mean square of 24 draws has a standard deviation of 1 / sqrt(48) = 14 %; three of these.
     assert np.sqrt(np.mean(turns**2)) == pytest.approx(stated["rotation_deg"], rel=0.43)
     assert np.sqrt(np.mean(shifts**2)) == pytest.approx(stated["translation"], rel=0.43)
 
 
 def test_depth_file_is_the_distance_along_the_axis(captures: dict[str, Path]) -> None:
-    setting = room_setting(8, **SIZE, seed=1)
+    setup = room_setup(8, **SIZE, seed=1)
     pose = (poses(captures["sharp"])[3] @ np.diag([1.0, -1.0, -1.0, 1.0]))[:3]
     source = ImageInput.open(str(captures["sharp"] / "truth" / "observed" / "depth" / "000003.exr"))
     assert source.spec().channelnames == ("Z",) and str(source.spec().format) == "float"
     depth = source.read_image("float")[..., 0]
     source.close()
-    # The pose went through a product with -1 and 0 and JSON, both exact; the file holds float32.
-    np.testing.assert_allclose(depth, setting.world.depth(pose, setting.lens), rtol=1e-6)
+    # The pose is exact: it was multiplied by -1 and 0 and stored as JSON. The depth file has float32.
+    np.testing.assert_allclose(depth, setup.world.depth(pose, setup.lens), rtol=1e-6)
 
 
-def test_novel_views_lie_off_the_path(captures: dict[str, Path]) -> None:
+def test_novel_views_are_off_the_path(captures: dict[str, Path]) -> None:
     novel, path = (poses(captures["sharp"] / "truth" / kind)[:, :3, 3] for kind in ("novel", "observed"))
     assert len(novel) == 4
     assert len(list((captures["sharp"] / "truth" / "novel" / "images").iterdir())) == 4
@@ -179,16 +179,18 @@ def test_video_shows_the_frames(tmp_path: Path) -> None:
         strict=True,
     ):
         frame = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB).astype(np.float64)
-        # Half the chroma and slight compression: 30 dB on this tiny noisy picture, and no shift of colour.
+        # Chroma at half resolution and slight compression give 30 dB on this tiny noisy image. Colours do not
+        # shift.
         assert np.mean((shown - frame) ** 2) < 255**2 / 10**3.0
         assert np.abs((shown - frame).mean((0, 1))).max() < 0.7
 
 
-def test_command_states_the_blur_and_refuses_in_two_lines(
+def test_command_prints_the_blur_and_refuses_in_two_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["synth", str(tmp_path / "a"), "--size", "96x54", "--frames", "2", "--protocol"]
-    assert all(name in PROTOCOL_HELP for name in PROTOCOLS)  # written out there: --help imports nothing heavy
+    # The help repeats the names, so that --help does not import the protocols.
+    assert all(name in PROTOCOL_HELP for name in PROTOCOLS)
     assert invoke([*command, "gs2e-sligth"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 2
     assert invoke([*command, "gs2e-slight"]) == 0
@@ -209,8 +211,8 @@ def test_refuses_an_unknown_protocol_and_a_used_folder(tmp_path: Path) -> None:
     assert (tmp_path / "x" / "mine.txt").read_text() == "keep"
 
 
-def test_what_is_compiled_lies_outside_the_package() -> None:
-    """The package may be read-only, and what lies in it is what was installed."""
+def test_compiled_kernels_are_outside_the_package() -> None:
+    """The package may be read-only, and should contain only installed files."""
     package = Path(raycast.__file__).parents[1]
     assert package not in Path(raycast._render.stats.cache_path).parents
 

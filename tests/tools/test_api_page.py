@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tools.api_page import page
+from tools.api_page import page, section
 
 ROOT = Path(__file__).parents[2]
 
@@ -10,3 +10,9 @@ ROOT = Path(__file__).parents[2]
 def test_page_is_current() -> None:
     """The command ``python -m tools.api_page > docs/api.md`` updates it."""
     assert page() == (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+
+
+def test_sections_of_a_docstring_become_markdown() -> None:
+    text = section("deblur")
+    assert "**Args**\n\n* `run`: A run with a trained scene.\n* `frame_id`: " in text
+    assert "**Example**\n\n```python\ndeblurred = cg.deblur(" in text and text.rstrip().endswith("```")

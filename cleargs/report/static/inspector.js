@@ -1,5 +1,5 @@
-// Two layers of one view under a slider. The page says what `describe(frame)` is: how the view is called (`view`),
-// the title and what stands below it (`title`, `role`), and the elements beside the pictures (`details`).
+// The inspector: two layers of one view under a slider. The page defines `describe(frame)`, which returns the name of
+// the view (`view`), the title and the line below it (`title`, `role`), and elements with data (`details`).
 "use strict";
 const report = JSON.parse(document.getElementById("data").textContent);
 const inspector = one("#inspector");
@@ -43,7 +43,7 @@ const showLayers = (frame) => {
   fillContact(frame);
 };
 
-// Every layer in small; choosing one lays it on the right.
+// Thumbnails of all layers. A click shows a layer on the right.
 const fillContact = (frame) => {
   one("#contact").replaceChildren(...Object.entries(frame.layers).map(([name, path]) => {
     const button = Object.assign(make("button"), { type: "button" });

@@ -1,4 +1,4 @@
-// Asks how far the run is, and shows it; when the run is done, its report takes over.
+// Shows the progress of a run. When the run is done, it opens the report.
 "use strict";
 {
   const EVERY_MS = 2000;
@@ -26,13 +26,13 @@
   const show = ({ name, now, stages, preview, report }) => {
     document.title = `${now ? now.stage : "idle"} · ${name} · ClearGS`;
     one("name").textContent = name;
-    one("label").textContent = now ? now.label : "Nothing is at work";
+    one("label").textContent = now ? now.label : "No stage is running";
     one("progress").hidden = !now;
     if (now && now.total) one("progress").value = now.done / now.total;
     else one("progress").removeAttribute("value");
     one("figures").textContent = now
       ? figures(now)
-      : "cleargs run continues it, cleargs report writes the page of these results.";
+      : "Continue with cleargs run, or write a report of these results with cleargs report.";
     one("preview").hidden = preview === null;
     if (preview !== null && one("picture").dataset.version !== preview) {
       one("picture").dataset.version = preview;
@@ -42,7 +42,7 @@
     one("report").hidden = !report;
   };
 
-  const look = async () => {
+  const update = async () => {
     try {
       const state = await (await fetch("/state.json")).json();
       if (state.done) {
@@ -51,9 +51,9 @@
       }
       show(state);
     } catch {
-      one("figures").textContent = "cleargs watch has ended; start it again to resume.";
+      one("figures").textContent = "cleargs watch has stopped. Start it again to continue.";
     }
-    setTimeout(look, EVERY_MS);
+    setTimeout(update, EVERY_MS);
   };
-  look();
+  update();
 }

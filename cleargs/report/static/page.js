@@ -1,4 +1,4 @@
-// What all pages do: copying, and filters of what stands below them.
+// Functions of all pages: buttons that copy text, and filters of a list.
 "use strict";
 const one = (selector, root = document) => root.querySelector(selector);
 const all = (selector, root = document) => [...root.querySelectorAll(selector)];
@@ -14,7 +14,7 @@ const make = (tag, text, className) => {
 const copy = async (text) => {
   try {
     await navigator.clipboard.writeText(text);
-  } catch { // browsers that keep the clipboard from pages on a disk
+  } catch { // some browsers deny the clipboard to pages that are opened from disk
     const area = document.body.appendChild(make("textarea"));
     area.value = text;
     area.select();

@@ -1,15 +1,15 @@
-// What the report of a run says of one frame.
+// Data of one frame in the report of a run.
 "use strict";
 const NAMES = {
-  R: "R, reliable appearance", B: "B, risk of degradation", G: "G, worth of its place", C: "C, coverage gained",
-  D: "D, new directions", O: "O, seen already", Z: "Z, middle of its stretch",
+  R: "R, reliability", B: "B, risk of degradation", G: "G, geometric utility", C: "C, coverage gain",
+  D: "D, pose diversity", O: "O, redundancy", Z: "Z, centrality in its bin",
 };
 
 const cues = (frame) => {
   const entries = Object.entries(frame.cues);
   if (entries.length === 0) return [];
   const section = make("section");
-  section.append(make("h3", "Cues: how bad, from 0 to 1"));
+  section.append(make("h3", "Cues, from 0 (good) to 1 (bad)"));
   for (const [name, value] of entries) {
     const line = make("div", undefined, "cue");
     const bar = make("i");
@@ -37,9 +37,9 @@ const describe = (frame) => {
   return {
     view: `Frame ${frame.id}`,
     title: `Frame ${frame.id} · ${frame.name}`,
-    role: (frame.role || "not judged") + weight,
+    role: (frame.role || "not rated") + weight,
     details: [
-      ...decision(frame), ...cues(frame), ...pairs("Scores of the allocation", figures),
-      ...pairs("Found", Object.entries(frame.found)), ...pairs("Image formation", formation)],
+      ...decision(frame), ...cues(frame), ...pairs("Frame scores", figures),
+      ...pairs("Camera effects", Object.entries(frame.found)), ...pairs("Image formation", formation)],
   };
 };

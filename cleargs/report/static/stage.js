@@ -1,5 +1,5 @@
-// The two scenes in 3D. The viewer and the scenes come as scripts, since a page on a disk may not read files.
-// People steer the second viewer; the first takes over its camera in every frame.
+// The two scenes in 3D. The viewer and the scenes are scripts, since a page that is opened from disk may not read files.
+// The user controls the second viewer. The first viewer copies its camera in every frame.
 "use strict";
 {
   const stage = one("#stage");
@@ -15,7 +15,7 @@
     document.head.append(script);
   });
 
-  // The script `name` holds its content gzipped, in base64.
+  // Loads a script that contains gzipped content in base64, and returns a URL of the content.
   const unpack = async (name, file, type) => {
     await loadScript(file);
     const bytes = Uint8Array.from(atob(window.packed[name]), (letter) => letter.charCodeAt(0));
@@ -43,7 +43,7 @@
       noanim: true,
       aa: scene.antialias,
     });
-    viewer.state.inputEnabled = false; // the keyboard is the page's until the stage has the focus
+    viewer.state.inputEnabled = false; // the page uses the keyboard until the stage has the focus
     await loaded(viewer);
     viewer.seek(start);
     viewer.app.once("frameend", () => panes[scene.key].classList.add("ready"));
@@ -68,7 +68,7 @@
       follow();
       status.textContent = "";
     } catch (error) {
-      status.textContent = "3D is not available in this browser; these are still pictures";
+      status.textContent = "3D is not available in this browser. These are still images.";
       console.warn(error);
     }
     document.documentElement.dataset.stage = after && before ? "ready" : "failed";
@@ -79,7 +79,7 @@
     begin();
   }, { rootMargin: "200px" }).observe(stage);
 
-  // -- steering: what happens on the left happens on the right --------------------------------------------
+  // -- input: events on the left viewer are sent to the right viewer ---------------------------------------
   for (const type of ["pointerdown", "wheel", "contextmenu"]) {
     panes.before.addEventListener(type, (event) => {
       if (!after) return;
@@ -126,23 +126,23 @@
   };
 
   const marks = all(".mark");
-  const stand = (id) => {
+  const showFrame = (id) => {
     const frame = report.frames[indexOf(id)];
     if (frame.time === null) return;
     for (const mark of marks) mark.classList.toggle("here", mark.dataset.frame === String(id));
     goTo(frame.time);
   };
   marks.forEach((mark, index) => {
-    mark.addEventListener("click", () => stand(mark.dataset.frame));
+    mark.addEventListener("click", () => showFrame(mark.dataset.frame));
     mark.addEventListener("keydown", (event) => {
-      if (event.key === "Enter" || event.key === " ") { event.preventDefault(); stand(mark.dataset.frame); }
+      if (event.key === "Enter" || event.key === " ") { event.preventDefault(); showFrame(mark.dataset.frame); }
       const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
       if (step) { event.preventDefault(); marks[(index + step + marks.length) % marks.length].focus(); }
     });
   });
   one("#stand").addEventListener("click", () => {
     inspector.close();
-    stand(report.frames[current].id);
+    showFrame(report.frames[current].id);
     stage.scrollIntoView({ block: "center" });
   });
   window.reportStage = { get before() { return before; }, get after() { return after; } };

@@ -1,1 +1,1 @@
-"""The evaluator ``qwen3-vl``: appearance cues from a vision-language model, one image at a time."""
+"""The evaluator ``qwen3-vl``: appearance cues from a vision-language model, one image per question."""

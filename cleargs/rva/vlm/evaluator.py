@@ -1,7 +1,7 @@
-"""Frames in, cues out: keeps what is scored, resumes after a kill, marks what could not be scored.
+"""Base class of the Qwen3-VL evaluators: it prepares images, caches scores and marks unscored frames.
 
-A model meets a frame as a picture: reduced to a stated size, masked pixels painted over, never enlarged.
-A server or a model in process answers the prompt about it.
+The model gets each frame reduced to a maximum size, with masked pixels painted grey. Subclasses send the
+prompt to a server or to a local model.
 """
 
 from __future__ import annotations
@@ -19,43 +19,50 @@ import numpy as np
 from cleargs.errors import StageError
 from cleargs.progress import Reporter
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, load_view, reduced
+from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, downscale, load_view
 from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.types import ArrayF64, ImageU8
 
-_MASKED = 127  # mid-grey, as the prompt calls it
+_MASKED = 127  # mid-grey, as the prompt says
 
 
 @dataclass(frozen=True, eq=False)
 class EncodedImage:
-    """What is shown to a model."""
+    """Image that the model gets."""
 
     rgb: ImageU8  # [h, w, 3] sRGB
     masked: bool
-    """Whether parts are painted grey."""
+    """True if parts are painted grey."""
 
     def data_url(self) -> str:
-        """As PNG: a lossy format would add artifacts of its own to those that are judged."""
+        """Return the image as the data URL of a PNG. A lossy format would add artifacts."""
         _, png = cv2.imencode(".png", cv2.cvtColor(self.rgb, cv2.COLOR_RGB2BGR))
         return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
 
 
 class UnscoredError(Exception):
-    """A frame got no valid scores, for the reason given; other frames may."""
+    """No valid scores for one frame, with the reason. Other frames may still be scored."""
 
 
 class QwenEvaluator(ABC):
-    """Evaluator ``qwen3-vl``: each frame alone, by the vision-language model of a subclass.
+    """Evaluator ``qwen3-vl``: scores each frame separately with the model of a subclass.
 
-    Scores are kept in ``cache``, one file a picture, as they come: a second call asks for the others only.
+    Scores are cached as soon as they arrive, one file per frame, so that an interrupted evaluation resumes.
     """
 
     version = QwenConfig.prompt
     workers = 1
-    """How many pictures the model takes at once, each in a thread of its own."""
+    """Number of images that are scored in parallel, each in its thread."""
 
     def __init__(self, config: QwenConfig, *, model: str, identity: str, cache: Path | None) -> None:
-        """``identity`` is whatever decides the scores next to the picture: they are kept under it."""
+        """Prepare the cache.
+
+        Args:
+            config: Settings of the evaluator.
+            model: Name of the model.
+            identity: Everything except the image that determines the scores; part of the cache's keys.
+            cache: Folder of the cache; None: no cache.
+        """
         self.name = f"qwen3-vl:{model}:prompt"
         self._config = config
         self._model = model
@@ -64,22 +71,25 @@ class QwenEvaluator(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Raise InputError where the model cannot be had."""
+        """Raise InputError if the model is unavailable."""
 
     @abstractmethod
-    def score(self, picture: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
-        """The cues of one picture.
+    def score(self, image: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
+        """Return the cues of one image.
 
-        Raises UnscoredError where this picture gets none, StageError or InputError where no picture would.
+        Raises:
+            UnscoredError: if this image gets no scores.
+            StageError, InputError: if no image would get scores.
         """
 
     def stop(self) -> None:  # noqa: B027
-        """Give up what is under way as soon as possible, where a subclass can; called from another thread."""
+        """Stop work as soon as possible, if the subclass can. Called from another thread."""
 
     def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
-        """See `Evaluator.evaluate`. ``threads`` is not used: the work is done elsewhere or has its own.
+        """Score all frames; see `Evaluator.evaluate`. ``threads`` is not used.
 
-        Raises StageError when no frame at all could be scored.
+        Raises:
+            StageError: if no frame could be scored.
         """
         cues = np.full((len(views), len(CUE_COLUMNS)), np.nan)
         faults: dict[int, str] = {}
@@ -112,4 +122,4 @@ class QwenEvaluator(ABC):
         if mask is not None:
             rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
         masked = mask is not None and not mask.all()
-        return self.score(EncodedImage(reduced(rgb, self._config.image_size), masked))
+        return self.score(EncodedImage(downscale(rgb, self._config.image_size), masked))

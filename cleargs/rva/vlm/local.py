@@ -1,7 +1,7 @@
-"""Qwen3-VL in process, through transformers: images only, each reply held to the schema token by token.
+"""Qwen3-VL in this process, with transformers. Decoding is constrained to the schema token by token.
 
-The model's own processor is not used: it loads a video processor, which wants torchvision. Its image
-processor (the variant on Pillow) and its tokenizer do the same alone.
+The model's processor class is not used, since it loads a video processor, which requires torchvision. The
+image processor (the variant for Pillow) and the tokenizer give the same inputs.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ _ARCHITECTURES = ("qwen3_vl", "qwen3_vl_moe")
 
 
 class QwenFolder(QwenEvaluator):
-    """Runs a model folder of this machine. Loads it when the first picture comes."""
+    """Runs the model of a local folder. The model is loaded when the first image is scored."""
 
     def __init__(self, config: QwenConfig, *, device: Literal["cpu", "cuda"], cache: Path | None) -> None:
-        """The folder's files are known by size and time: reading gigabytes for a digest is left to the
-        stage's key.
+        """Identify the model in the cache by the names, sizes and times of its files.
+
+        Hashing gigabytes is left to the stage's key.
         """
         self._folder = Path(config.model_dir).expanduser().absolute()
         self._device = device
@@ -41,20 +42,23 @@ class QwenFolder(QwenEvaluator):
         super().__init__(config, model=self._folder.name, identity=identity, cache=cache)
 
     def check(self) -> None:
-        """Raise InputError when the extra is not installed or the folder is not that of a Qwen3-VL model.
-        Reads no weights.
+        """Check the extra and the folder without reading weights.
+
+        Raises:
+            InputError: if the extra is not installed, or if the folder is not that of a Qwen3-VL model.
         """
         try:
             import llguidance.hf  # noqa: F401
             from transformers import AutoConfig
         except ImportError as error:
             raise InputError(
-                f"qwen3-vl in process cannot be loaded: {error.msg}", hint="pip install 'cleargs[vlm]'"
+                f"the libraries for a local qwen3-vl cannot be loaded: {error.msg}",
+                hint="pip install 'cleargs[vlm]'",
             ) from error
         with self._load_errors():
             kind = AutoConfig.from_pretrained(self._folder, local_files_only=True).model_type
             if kind not in _ARCHITECTURES:
-                raise ValueError(f"it is of the kind {kind}, not one of {', '.join(_ARCHITECTURES)}")
+                raise ValueError(f"its architecture is {kind}, not one of {', '.join(_ARCHITECTURES)}")
 
     @contextmanager
     def _load_errors(self) -> Iterator[None]:
@@ -62,15 +66,16 @@ class QwenFolder(QwenEvaluator):
             yield
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
-                f"{self._folder} holds no Qwen3-VL model that can be loaded: {str(error).splitlines()[0]}",
-                hint="give rva.qwen.model_dir the folder with config.json, the weights and the tokenizer",
+                f"cannot load a Qwen3-VL model from {self._folder}: {str(error).splitlines()[0]}",
+                hint="set rva.qwen.model_dir to the folder with config.json, the weights and the tokenizer",
             ) from error
 
     @cached_property
     def _loaded(self) -> tuple[Any, Any, Any, Any]:
-        """The model, its tokenizer, its image processor, and what matches replies to the schema.
+        """The model, its tokenizer, its image processor, and the matcher of the schema.
 
-        Raises InputError as `check`, and when the weights cannot be loaded.
+        Raises:
+            InputError: as `check`, or if the weights cannot be loaded.
         """
         self.check()
         import llguidance
@@ -94,27 +99,27 @@ class QwenFolder(QwenEvaluator):
         matcher = llguidance.LLMatcher(vocabulary, grammar)
         return model.to(self._device).eval(), tokenizer, images, matcher
 
-    def score(self, picture: EncodedImage) -> ArrayF64:
-        """See `QwenEvaluator.score`. Greedy decoding: the same picture gets the same scores."""
+    def score(self, image: EncodedImage) -> ArrayF64:
+        """Return the cues of one image, by greedy decoding; see `QwenEvaluator.score`."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._config.local_threads)
         try:
-            text = self._reply(picture)
+            text = self._reply(image)
         finally:
             torch.set_num_threads(threads)
         try:
             return parse_reply(text)
         except ReplyError as fault:  # a reply cut off at max_tokens
-            raise UnscoredError(f"the reply cannot be used: {fault}") from None
+            raise UnscoredError(f"the reply is invalid: {fault}") from None
 
-    def _reply(self, picture: EncodedImage) -> str:
-        """The reply to the prompt about ``picture``; a valid object unless the model runs out of tokens."""
+    def _reply(self, image: EncodedImage) -> str:
+        """Return the reply to the prompt. It is a valid object unless it reaches ``max_tokens``."""
         model, tokenizer, images, matcher = self._loaded
-        seen = images(images=[picture.rgb], return_tensors="pt")
+        seen = images(images=[image.rgb], return_tensors="pt")
         pads = int(seen["image_grid_thw"].prod()) // images.merge_size**2
         chat = (
             f"<|im_start|>user\n<|vision_start|>{_IMAGE * pads}<|vision_end|>"
-            f"{prompt_text(masked=picture.masked)}<|im_end|>\n<|im_start|>assistant\n"
+            f"{prompt_text(masked=image.masked)}<|im_end|>\n<|im_start|>assistant\n"
         )
         ids = tokenizer(chat, return_tensors="pt", add_special_tokens=False)["input_ids"].to(model.device)
         matcher.reset()
@@ -138,9 +143,9 @@ class QwenFolder(QwenEvaluator):
 
 
 class _SchemaMask:
-    """A logits processor of transformers that leaves only tokens with which the reply still fits the schema.
+    """A logits processor of transformers that allows only tokens with which the reply matches the schema.
 
-    llguidance's own masking kernel goes through torch.compile and so wants a C++ compiler; this does not.
+    The masking kernel of llguidance uses torch.compile and so requires a C++ compiler. This one does not.
     """
 
     def __init__(self, matcher: Any, prompt_length: int) -> None:

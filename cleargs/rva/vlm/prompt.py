@@ -1,8 +1,7 @@
-"""The question to the model, and its reply as cues: strictly what the schema says, or what is wrong with it.
-Nothing is clipped, filled in or guessed.
+"""The question to the model, and the parser of its reply.
 
-The text in ``prompt.txt`` is frozen under `QwenConfig.prompt`, which enters the stage's key and the table:
-whoever changes a word raises it.
+The parser is strict: it does not clip, complete or guess values. Each change of ``prompt.txt`` must raise
+`QwenConfig.prompt`, which is part of the stage's key and of the table.
 """
 
 from __future__ import annotations
@@ -22,17 +21,18 @@ CUES = R_CUES + B_CUES
 
 
 def prompt_text(*, masked: bool) -> str:
-    """The question that goes with an image; ``masked``: parts of it are painted grey and do not count."""
+    """Return the question about an image. If ``masked``, it says to ignore the grey parts."""
     text = Path(__file__).with_name("prompt.txt").read_text(encoding="utf-8").rstrip("\n")
     mask = "Flat mid-grey areas are masked out: ignore them and their borders.\n" if masked else ""
     return text.replace("{mask}", mask)
 
 
 def reply_schema() -> dict[str, Any]:
-    """JSON schema of a reply.
+    """Return the JSON schema of a reply.
 
-    Scores are an enumeration: every decoder for constrained output knows it (bounds of numbers, many do not),
-    and a model without sense cannot write digits without end. Models tell no finer scores apart.
+    Scores are an enumeration in steps of 0.05. All constrained decoders support enumerations, but many do not
+    support bounds of numbers. An enumeration also prevents endless digits. Models do not distinguish finer
+    steps.
     """
     score = {"type": "number", "enum": [round(k / 20, 2) for k in range(21)]}
     return {
@@ -44,14 +44,15 @@ def reply_schema() -> dict[str, Any]:
 
 
 class ReplyError(Exception):
-    """What is wrong with a reply, in words that the model can be told. Holds no text of the reply."""
+    """An invalid reply. The message is sent to the model and contains no text of the reply."""
 
 
 def parse_reply(text: str) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
-    """The cues in the one JSON object of ``text``; prose around it is passed over.
+    """Return the cues in the JSON object of ``text``. Other text around the object is ignored.
 
-    Raises ReplyError when there is no such object, when it breaks the schema (a missing, unknown or
-    non-numeric value, one outside [0, 1]), or when several objects differ.
+    Raises:
+        ReplyError: if there is no object, if it does not match the schema (a missing, unknown or non-numeric
+            value, or one outside [0, 1]), or if several objects differ.
     """
     faults, found = [], set()
     for value in _objects(text.rpartition("</think>")[2]):
@@ -67,7 +68,7 @@ def parse_reply(text: str) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
 
 
 def _objects(text: str) -> Iterator[dict[str, Any]]:
-    """The JSON objects in ``text`` that lie in no other, from left to right."""
+    """Yield the outermost JSON objects in ``text``, from left to right."""
     decoder = json.JSONDecoder()
     start = text.find("{")
     while start >= 0:
@@ -89,7 +90,7 @@ def _scores(value: dict[str, Any]) -> tuple[float, ...]:
     for name in CUES:
         score = value[name]
         if isinstance(score, bool) or not isinstance(score, int | float):
-            raise ReplyError(f"{name} is no number")
+            raise ReplyError(f"{name} is not a number")
         if not 0.0 <= score <= 1.0:  # NaN included
             raise ReplyError(f"{name} lies outside [0, 1]")
     return tuple(float(value[name]) for name in CUES)

@@ -1,4 +1,4 @@
-"""The GPU's part of `cleargs.splat.backend.Backend`: tensors in, Triton kernels inside."""
+"""`cleargs.splat.backend.Backend` for NVIDIA GPUs: Triton kernels behind functions of tensors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import torch
 from torch import Tensor
 
 from cleargs.splat.gaussians import Gaussians
+
+# There are no GPU kernels for the search of a frame's motion.
+from cleargs.splat.kernels.cpu.backend import misfit as misfit
+from cleargs.splat.kernels.cpu.backend import normal_equations as normal_equations
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.cuda.densify import add_position_noise as add_position_noise
 from cleargs.splat.kernels.cuda.densify import refine as refine
@@ -22,22 +26,24 @@ from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 
 
 def rasteriser(device: torch.device) -> CudaRasteriser:
-    """Raises InputError when the kernels cannot run on ``device``."""
+    """Return a rasteriser. Raises InputError if the kernels cannot run on ``device``."""
     support.require(device)
     return CudaRasteriser(device)
 
 
 def warm_up() -> None:
-    """Nothing: Triton compiles a kernel for the types and sizes of its first call."""
+    """Do nothing: Triton compiles a kernel for the types and sizes of its first call."""
 
 
 def squared_errors(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[float, float]:
+    """See `Backend`."""
     errors = (image.detach().double() - target.double()).square()
     errors = errors if mask is None else errors[mask]
     return float(errors.sum()), float(errors.numel())
 
 
 def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
+    """See `Backend`."""
     if opacity > 0.0:
         opacities = gaussians.logit_opacities.sigmoid()
         gradients.logit_opacities += opacity / gaussians.num * opacities * (1 - opacities)

@@ -1,8 +1,8 @@
-"""Which splats touch which tile, in depth order.
+"""Lists of the splats that touch each tile, in depth order.
 
-Depths are sorted once (N keys of 32 bits). Pairs are then made in that order, and a stable sort by tile alone
-(keys of 16 bits for up to 32,766 tiles) leaves every tile's pairs from near to far, ties by index. Both sorts
-are torch's, which are radix sorts on the GPU.
+Depths are sorted once (N keys of 32 bits). Pairs are then listed in that order. A stable sort by tile only
+(keys of 16 bits for up to 32,766 tiles) leaves the pairs of every tile from near to far, ties by index. Both
+sorts are torch's, which are radix sorts on the GPU.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from cleargs.splat.kernels.cuda import device_layout
 
 
 def key_type(tiles: int) -> torch.dtype:
-    """The smallest integer type that numbers the tiles and their end."""
+    """Return the smallest integer type that holds all tile numbers and their end."""
     return torch.int16 if tiles < 2**15 - 1 else torch.int32
 
 
 @triton.jit
 def tile_range(low, high, tiles):
-    """Tiles [begin, end) that hold a pixel centre of the interval [low, high] px; 0, 0 when there is none."""
-    # Bounded as floats first: the conversion of huge numbers to integers is undefined.
+    """Return tiles [begin, end) with a pixel centre in the interval [low, high] px; 0, 0 if there is none."""
+    # Bounded as floats first: the conversion of very large floats to integers is undefined.
     limit = (tiles * layout.TILE).to(tl.float64)
     first = tl.minimum(tl.maximum(tl.ceil(low - constants.PIXEL_CENTRE), 0.0), limit)
     last = tl.minimum(tl.maximum(tl.floor(high - constants.PIXEL_CENTRE), -1.0), limit - 1.0)
@@ -37,13 +37,13 @@ def tile_range(low, high, tiles):
 
 @triton.jit
 def reach_of_rows(extent_y):
-    """Half height of the ellipse with its margin, float64."""
+    """Return the half height of the ellipse with its margin, float64."""
     return extent_y.to(tl.float64) * 1.001 + 0.001
 
 
 @triton.jit
 def tile_rows(mean_y, extent_y, height):
-    """Rows of tiles [begin, end) that the ellipse alpha >= 1/255 may touch."""
+    """Return the rows of tiles [begin, end) that the ellipse alpha >= 1/255 may touch."""
     mean = mean_y.to(tl.float64)
     extent = reach_of_rows(extent_y)
     return tile_range(mean - extent, mean + extent, (height + layout.TILE - 1) // layout.TILE)
@@ -51,13 +51,13 @@ def tile_rows(mean_y, extent_y, height):
 
 @triton.jit
 def tile_columns(ellipse, row, width):
-    """Tiles [begin, end) of one row of tiles that the ellipse alpha >= 1/255 touches.
+    """Return the tiles [begin, end) of one row of tiles that the ellipse alpha >= 1/255 touches.
 
     ``ellipse`` holds MEAN_X, MEAN_Y, BEND_X, SKEW, BEND_Y, LOG2_OPACITY, EXTENT_Y and EXTENT_X_AT.
 
-    Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave, so it is
-    largest at the ellipse's rightmost point, or at the band's nearest line to it; the left edge is its
-    mirror.
+    Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave. It is
+    largest at the ellipse's rightmost point, or at the line of the band that is nearest to that point. The
+    left edge is the mirror image.
     """
     mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at = ellipse
     mean = mean_y.to(tl.float64)
@@ -75,7 +75,7 @@ def tile_columns(ellipse, row, width):
     right = k * right_at + tl.sqrt(tl.maximum(t - e * right_at * right_at, 0.0) / a)
     left = k * left_at - tl.sqrt(tl.maximum(t - e * left_at * left_at, 0.0) / a)
     centre = mean_x.to(tl.float64)
-    # MEAN_X and SKEW were rounded to float32 (6e-8), which counts when the mean is far away.
+    # MEAN_X and SKEW were rounded to float32 (6e-8), which matters if the mean is far away.
     margin = 1e-3 + 2e-7 * (tl.abs(centre) + tl.abs(k) * extent)
     return tile_range(
         centre + left - margin, centre + right + margin, (width + layout.TILE - 1) // layout.TILE
@@ -84,7 +84,7 @@ def tile_columns(ellipse, row, width):
 
 @triton.jit
 def count_tiles(ellipse, visible, width, height):
-    """Number of tiles that each splat touches, int32; as many as ``list_pairs`` will write."""
+    """Return the number of tiles that each splat touches, int32. ``list_pairs`` writes as many."""
     rows = tile_rows(ellipse[1], ellipse[6], height)
     top, bottom = tl.where(visible, rows[0], 0), tl.where(visible, rows[1], 0)
     count = tl.zeros_like(top)
@@ -109,9 +109,9 @@ def list_pairs(
     height,
     BLOCK: tl.constexpr,
 ):
-    """The tile and the Gaussian of every slot, and each Gaussian's first slot ``pair_starts`` [N] int32.
+    """Store tile and Gaussian of every slot, and each Gaussian's first slot ``pair_starts`` [N] int32.
 
-    Lane r takes the Gaussian ``order[r]``, whose slots end before ``pair_ends[r]``.
+    Lane r handles the Gaussian ``order[r]``, whose slots end before ``pair_ends[r]``.
     """
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = rank < n
@@ -148,7 +148,7 @@ def list_pairs(
 
 @triton.jit(do_not_specialize=["pairs"])
 def order_pairs(sorted_slots, pair_owners, pair_ids, pair_slots, pairs, BLOCK: tl.constexpr):
-    """The Gaussian and the slot (both int32) of every place, from torch's int64 order of the slots."""
+    """Store the Gaussian and the slot (both int32) of every place, from torch's int64 order of the slots."""
     place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     mask = place < pairs
     slot = tl.load(sorted_slots + place, mask=mask, other=0)
@@ -157,12 +157,15 @@ def order_pairs(sorted_slots, pair_owners, pair_ids, pair_slots, pairs, BLOCK: t
 
 
 def tile_starts(sorted_tiles: Tensor, tiles: int) -> Tensor:
-    """First place of every tile and the end, [tiles + 1] int32."""
+    """Return the first place of every tile, and the end: [tiles + 1] int32."""
     numbers = torch.arange(tiles + 1, dtype=sorted_tiles.dtype, device=sorted_tiles.device)
     return torch.searchsorted(sorted_tiles, numbers, out_int32=True)
 
 
 def chunk_starts(starts: Tensor) -> Tensor:
-    """First chunk of every tile and the end, [tiles + 1] int32, from the first place of every tile."""
+    """Return the first chunk of every tile, and the end: [tiles + 1] int32.
+
+    ``starts`` is the first place of every tile, and the end.
+    """
     chunks = (starts.diff() + (device_layout.CHUNK - 1)) // device_layout.CHUNK
     return torch.nn.functional.pad(chunks.cumsum(0), (1, 0)).to(torch.int32)

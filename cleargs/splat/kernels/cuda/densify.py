@@ -1,7 +1,7 @@
-"""Refinement and noise of 3DGS-MCMC on the device; the rules are those of ``cleargs.splat.densification``.
+"""Refinement and noise of 3DGS-MCMC on the GPU, by the rules of ``cleargs.splat.densification``.
 
-A refinement happens every so many steps and is made of torch operations; the noise of every step is one
-kernel. Draws come from Philox counters keyed by the step's seed: the same device draws the same each time.
+A refinement is rare and consists of torch operations. The noise of every step is one kernel. Random numbers
+come from Philox counters whose key is the step's seed, so that one device draws the same numbers each time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BLOCK = 256
 
 
 def seed_of(numbers: Sequence[int]) -> int:
-    """A 63-bit seed from some numbers, stateless as NumPy's."""
+    """Return a 63-bit seed that depends on ``numbers`` only."""
     return int(np.random.SeedSequence([*numbers]).generate_state(1, np.uint64)[0] >> 1)
 
 
@@ -39,7 +39,7 @@ def refine(
     min_opacity: float,
     seed: Sequence[int],
 ) -> tuple[Gaussians, Moments]:
-    """``densification.refine``. What is given is changed and must not be used again."""
+    """See ``densification.refine``. The arguments are changed: do not use them again."""
     running = [moments.first, moments.second]
     generator = torch.Generator(gaussians.device).manual_seed(seed_of(seed))
     errors, start = errors.double(), gaussians.num
@@ -71,7 +71,7 @@ def refine(
 
 
 def _placed(tensor: Tensor, places: Tensor, rows: Tensor) -> Tensor:
-    """``densification._placed``."""
+    """See ``densification._placed``."""
     longer = max(len(tensor), 1 + int(places.max())) if len(places) else len(tensor)
     if longer > len(tensor):
         tensor = torch.cat([tensor, tensor.new_zeros(longer - len(tensor), *tensor.shape[1:])])
@@ -80,13 +80,13 @@ def _placed(tensor: Tensor, places: Tensor, rows: Tensor) -> Tensor:
 
 
 def sample_once(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """``densification.sample_once`` of float64 ``weights`` [N]."""
+    """See ``densification.sample_once``; ``weights`` [N] are float64."""
     draws = torch.rand(len(weights), generator=generator, dtype=torch.float64, device=weights.device)
     return torch.sort(-torch.log1p(-draws) / weights, stable=True).indices[:count]
 
 
 def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: float) -> dict[str, Tensor]:
-    """``densification._halves``: make the Gaussians ``cut`` one of their halves, and return the others."""
+    """Make each Gaussian in ``cut`` its first half and return the other halves: ``densification._halves``."""
     rows = torch.arange(len(cut), device=cut.device)
     longest = gaussians.log_scales[cut].argmax(dim=1)
     axes = rotation_matrices(gaussians.rotations[cut])[rows, :, longest]
@@ -104,7 +104,7 @@ def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: flo
 def position_noise_kernel(
     means, log_scales, rotations, logits, n, seed, amount, min_opacity, cut, BLOCK: tl.constexpr
 ):
-    """Add ``amount`` covariance times a normal draw to the means, faded out around ``min_opacity``."""
+    """Add ``amount`` * covariance * a normal draw to the means, less above ``min_opacity``."""
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = g < n
     opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + g, mask=mask, other=0.0)))
@@ -131,7 +131,7 @@ def position_noise_kernel(
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
-    """Noise on the means for one step, in place; only Gaussians below ``densification.NOISE_CUT`` feel it."""
+    """Add the noise of one step to the means of Gaussians below ``densification.NOISE_CUT``, in place."""
     position_noise_kernel[(-(-gaussians.num // BLOCK),)](
         gaussians.means,
         gaussians.log_scales,

@@ -1,11 +1,11 @@
-"""What the GPU kernels hand on beyond the layouts of both back ends (``kernels.splat_layout``).
+"""Layouts of the data between GPU kernels, next to those of both back ends (``kernels.splat_layout``).
 
-A *pair* is a (tile, splat) that touch. Pairs have two numberings: their *slot* (all pairs of the nearest
-splat, of the next, ...), in which they are made and in which the backward pass leaves its sums, and their
-*place* (all pairs of tile 0 from near to far, of tile 1, ...), in which they are blended.
+A *pair* is a tile and a splat that touch. A pair has two numbers. Its *slot* counts by splat: all pairs of
+the nearest splat, then of the next. Pairs are listed by slot, and the backward pass stores its sums by slot.
+Its *place* counts by tile: all pairs of tile 0 from near to far, then of tile 1. Pairs are blended by place.
 
-A *chunk* is ``CHUNK`` places of one tile. The forward pass leaves the transmittance behind each chunk and the
-colour that it added, so that the backward pass treats all chunks at once.
+A *chunk* is ``CHUNK`` places of one tile. The forward pass stores the transmittance behind each chunk and the
+colour that the chunk added, so that the backward pass treats all chunks at the same time.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from cleargs.splat.constants import LOG2_ALPHA_CUT, SSIM_RADIUS, SSIM_SIGMA
 CHUNK = 64
 """Pairs between two checkpoints of the forward pass."""
 
-# Planes of TILE_PIXELS values that the forward pass leaves for each chunk.
-CHUNK_TRANSMITTANCE = 0  # T behind the chunk
-CHUNK_RED = 1  # what the chunk added to the pixel
+# Planes of TILE_PIXELS values that the forward pass stores for each chunk.
+CHUNK_TRANSMITTANCE = 0  # transmittance behind the chunk
+CHUNK_RED = 1  # colour that the chunk added to the pixel
 CHUNK_GREEN = 2
 CHUNK_BLUE = 3
 CHUNK_DEPTH = 4
@@ -43,7 +43,7 @@ HALF_LOG2E = 0.5 / math.log(2.0)
 TWO_LN2 = 2.0 * math.log(2.0)
 
 LOG2_REACH_CUT = LOG2_ALPHA_CUT - 2e-3
-"""Ellipses are taken larger by this much in log2(alpha) when tiles are listed; pixels decide alone."""
+"""Lower cut of log2(alpha) for the lists of tiles. Pixels use the exact cut."""
 
 
 def _ssim_window() -> tuple[float, ...]:

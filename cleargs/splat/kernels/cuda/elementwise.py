@@ -1,4 +1,4 @@
-"""Kernels of one pass over numbers or pixels: Adam and affine colour."""
+"""Kernels with one pass over numbers or pixels: Adam and affine colour."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ def adam(
     root_correction,
     BLOCK: tl.constexpr,
 ):
-    """Update ``parameter`` [size] and its moments in place; element i has the rate ``rates[i % columns]``.
+    """Update ``parameter`` [size] and its moments in place (Kingma and Ba 2015).
 
-    ``correction`` is 1 - beta1^t, ``root_correction`` sqrt(1 - beta2^t).
+    Element i has the learning rate ``rates[i % columns]``. ``correction`` is 1 - beta1^t, ``root_correction``
+    is sqrt(1 - beta2^t).
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     mask = i < size
@@ -75,7 +76,7 @@ def adam_step(
 
 @triton.jit(do_not_specialize=["pixels"])
 def map_pixels(image, affine, output, pixels, BLOCK: tl.constexpr):
-    """output = affine[:, :3] image + affine[:, 3]; images [pixels, 3], affine [3, 4]."""
+    """Store affine[:, :3] image + affine[:, 3]; images [pixels, 3], affine [3, 4]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = i < pixels
     red = tl.load(image + i * 3, mask=mask, other=0.0)
@@ -89,7 +90,7 @@ def map_pixels(image, affine, output, pixels, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize=["pixels"])
 def map_backward(image, affine, grad_output, grad_image, partials, pixels, BLOCK: tl.constexpr):
-    """grad_image = affine[:, :3]ᵀ grad_output, and each program's share of dL/d(affine) [programs, 12]."""
+    """Store affine[:, :3]ᵀ grad_output, and each program's part of dL/d(affine): [programs, 12]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = i < pixels
     for source in tl.static_range(3):
@@ -107,7 +108,7 @@ def map_backward(image, affine, grad_output, grad_image, partials, pixels, BLOCK
 
 
 def _on_device(affine: Tensor, image: Tensor) -> Tensor:
-    # Without waiting: what is copied so is read before the call returns.
+    # Without waiting for the device: the source is read before the call returns.
     return affine.detach().float().contiguous().to(image.device, non_blocking=True)
 
 
@@ -121,7 +122,7 @@ def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
 
 
 def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
-    """See ``cleargs.formation.exposure.affine_backward``; both gradients stay on the device."""
+    """See ``cleargs.formation.exposure.affine_backward``. Both gradients stay on the device."""
     image, affine = image.detach().contiguous(), _on_device(affine, image)
     grad_image = torch.empty_like(image)
     pixels = image.numel() // 3

@@ -1,9 +1,9 @@
-"""Blur, rolling shutter and defocus as one warp, and its transpose; the mathematics is that of the CPU back
-end's ``frame_warp``.
+"""Blur, rolling shutter and defocus as one warp, and its transpose.
 
-A lane is a pixel of the photograph, both ways. Backward, pixels send their light to whatever place they saw,
-many to the same one and in no order. So light is sent in whole numbers of a tiny unit, whose sum does not
-depend on the order: the transpose repeats bit for bit.
+The mathematics is that of the CPU back end's ``frame_warp``. A lane is a pixel of the observed image, in both
+directions. Backward, each pixel adds its light to the places that it saw. Many pixels add to one place, in no
+fixed order. Light is therefore added in integer multiples of a small unit: their sum does not depend on the
+order, and the transpose gives the same bits each time.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
 BLOCK = 128
 
 SUM_BITS = 61
-"""Bits of what all pixels can send to one place together; the shares of a cubic may make it 25/16 of that."""
+"""Bits of the largest sum in one place. The shares of a cubic may make it 25/16 as large."""
 
 LEAST_LIGHT = 1e-18
-"""The unit is a share of the brightest light, which is taken for no less than this."""
+"""Lower bound of the brightest light, of which the unit is a share."""
 
 
 @triton.jit
 def twist_of(motion, part):
-    """Six numbers of a frame's motion: ``part`` 0 is the pose, 1 the blur, 2 the skew."""
+    """Return six numbers of a frame's motion: ``part`` 0 is the pose, 1 the blur, 2 the skew."""
     first = motion + layout.TWISTS + 6 * part
     return (
         tl.load(first),
@@ -42,7 +42,7 @@ def twist_of(motion, part):
 
 @triton.jit
 def flow(x, y, near, twist):
-    """Where a pixel on the ray (x, y, 1) of this nearness looks under a twist, in units of fx."""
+    """Return the displacement, in units of fx, of a pixel on the ray (x, y, 1) under a twist."""
     tx, ty, tz, rx, ry, rz = twist
     along_x = near * (x * tz - tx) + x * y * rx - (1.0 + x * x) * ry + y * rz
     along_y = near * (y * tz - ty) + (1.0 + y * y) * rx - x * y * ry - x * rz
@@ -51,7 +51,7 @@ def flow(x, y, near, twist):
 
 @triton.jit(do_not_specialize=["height", "width", "margin"])
 def displace(depth, alpha, motion, offset, sweep, radius, height, width, margin, BLOCK: tl.constexpr):
-    """The fields of a frame's motion and defocus; depth and alpha [H + 2 margin, W + 2 margin]."""
+    """Store the fields of a frame's motion and defocus; depth, alpha [H + 2 margin, W + 2 margin]."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane = height * width
     inside = pixel < plane
@@ -80,7 +80,7 @@ def displace(depth, alpha, motion, offset, sweep, radius, height, width, margin,
 
 @triton.jit
 def look(pixel, inside, offset, sweep, radius, height, width, margin):
-    """Where pixels look at the middle of the exposure, what they sweep, and the radius of their discs."""
+    """Return places that pixels see in the middle of the exposure, their sweeps, and their discs' radii."""
     plane = height * width
     x = (pixel % width + margin).to(tl.float32) + tl.load(offset + pixel, mask=inside, other=0.0)
     y = (pixel // width + margin).to(tl.float32) + tl.load(offset + plane + pixel, mask=inside, other=0.0)
@@ -91,7 +91,7 @@ def look(pixel, inside, offset, sweep, radius, height, width, margin):
 
 @triton.jit
 def between(position, count):
-    """The first of the two pixels, of ``count``, that ``position`` lies between; the share of the second."""
+    """Return the first of the two pixels next to ``position``, of ``count``, and the share of the second."""
     last = (count - 1).to(tl.float32)
     position = tl.minimum(tl.maximum(position, 0.0), last)
     first = tl.minimum(position, tl.maximum(last - 1.0, 0.0)).to(tl.int32)
@@ -100,10 +100,10 @@ def between(position, count):
 
 @triton.jit
 def shares(a, TAPS: tl.constexpr):
-    """Shares of the pixels about a place that lies ``a`` behind the first of two, or the second of four.
+    """Return the shares of the pixels around a place.
 
-    Source of the latter: Keys, "Cubic convolution interpolation for digital image processing" (1981), with
-    -1/2.
+    The place is ``a`` pixels behind the first of two, or the second of four. The four shares are those of
+    Keys, "Cubic convolution interpolation for digital image processing" (1981), with -1/2.
     """
     b = 1.0 - a
     if TAPS == 2:
@@ -115,7 +115,7 @@ def shares(a, TAPS: tl.constexpr):
 
 @triton.jit
 def neighbour(first, tap: tl.constexpr, count, TAPS: tl.constexpr):
-    """The index of a pixel that has a share; beyond the border that of the one at the border."""
+    """Return the index of a pixel that has a share; outside the image, that of the nearest border pixel."""
     return tl.minimum(tl.maximum(first + (tap - (TAPS // 2 - 1)), 0), count - 1)
 
 
@@ -135,9 +135,9 @@ def gather_light(
     TAPS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """What the sensor gathers of a still image: [H + 2 margin, W + 2 margin, 4] -> ``light`` [H, W, 4].
+    """Store the light that the sensor gathers from a still image, ``light`` [H, W, 4].
 
-    ``share`` is that of each of the ``count`` samples.
+    ``image`` [H + 2 margin, W + 2 margin, 4] is linear. ``share`` is the weight of each of ``count`` samples.
     """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < height * width
@@ -176,7 +176,7 @@ def return_light(
     TAPS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """The transpose of `gather_light`: adds ``light`` times ``scale`` to ``sums``, which are int64."""
+    """Add ``light`` times ``scale`` to ``sums`` (int64): the transpose of `gather_light`."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < height * width
     channel = tl.arange(0, layout.CHANNELS)[None, :]
@@ -201,7 +201,7 @@ def return_light(
 
 @triton.jit(do_not_specialize=["pixels"])
 def follow_curve(image, curve, out, slope, pixels, FROM: tl.constexpr, TO: tl.constexpr, BLOCK: tl.constexpr):
-    """The colours of images [pixels, FROM or TO] through a curve, and its slope there [pixels, 3]."""
+    """Store an image [pixels, FROM] through a curve, [pixels, TO], and the curve's slope [pixels, 3]."""
     pixel = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))[:, None]
     channel = tl.arange(0, layout.CHANNELS)[None, :]
     coloured = (pixel < pixels) & (channel < 3)
@@ -217,7 +217,7 @@ def follow_curve(image, curve, out, slope, pixels, FROM: tl.constexpr, TO: tl.co
 
 @memory_errors()
 def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) -> DisplacementFields:
-    """See ``cleargs.formation.warp.displacement_fields``; ``motion`` [25] lies on the CPU."""
+    """See ``cleargs.formation.warp.displacement_fields``. ``motion`` [25] is on the CPU."""
     height, width = (side - 2 * margin for side in depth.shape)
     offset, sweep = depth.new_empty(2, height, width), depth.new_empty(2, height, width)
     radius = depth.new_empty(height, width)
@@ -264,7 +264,7 @@ def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, 
     """See ``cleargs.formation.warp.Warp.transpose``."""
     height, width = fields.radius.shape
     brightest = light.abs().amax().clamp(min=LEAST_LIGHT)
-    # The power of two above it, so that scaling rounds nothing; NaN, and with it all, if it is not finite.
+    # The next power of two, so that scaling rounds nothing. It is NaN if the light is not finite.
     bound = brightest / torch.frexp(brightest).mantissa
     bits = SUM_BITS - (height * width - 1).bit_length()
     sums = torch.zeros(
@@ -288,7 +288,7 @@ def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, 
 
 
 def _taps(samples: Tensor) -> int:
-    """Pixels that have a share of a place, along an axis."""
+    """Return the number of pixels with a share of a place, along one axis."""
     return 4 if len(samples) == 1 else 2
 
 

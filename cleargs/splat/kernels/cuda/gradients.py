@@ -1,7 +1,7 @@
-"""From the rasteriser's pixel sums back to gradients of the raw parameters.
+"""Gradients of the raw parameters, from the rasteriser's sums over pixels.
 
-The chain rule of ``projection`` written out as in the CPU back end's ``gradients``, in float64 but for the
-colours.
+The chain rule of ``projection``, as in the CPU back end's ``gradients``. It is computed in float64, except
+for the colours.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def total(
     ROWS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Sum each Gaussian's slots in float64, ``BLOCK`` at a time in their order: ``totals`` [COLUMNS, N]."""
+    """Sum each Gaussian's slots in float64, in their order, ``BLOCK`` at a time: ``totals`` [COLUMNS, N]."""
     g = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     mask = g < n
     count = tl.load(tile_counts + g, mask=mask, other=0)
@@ -57,7 +57,7 @@ def total(
 
 @triton.jit
 def quaternion_gradient(q, c0, c1, c2):
-    """dL/d(unit quaternion) from the gradients c0, c1, c2 of the rotation matrix's columns."""
+    """Return dL/d(unit quaternion) from the gradients c0, c1, c2 of the rotation matrix's columns."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     return (
         2.0 * (x * (c1[2] - c2[1]) + y * (c2[0] - c0[2]) + z * (c0[1] - c1[0])),
@@ -69,7 +69,7 @@ def quaternion_gradient(q, c0, c1, c2):
 
 @triton.jit
 def sum_of(totals, column: tl.constexpr, g, n, some):
-    """One column of ``totals``, 0 for a Gaussian without pairs."""
+    """Return one column of ``totals``; 0 for a Gaussian without pairs."""
     return tl.load(totals + column * n.to(tl.int64) + g, mask=some, other=0.0)
 
 
@@ -96,7 +96,7 @@ def backpropagate(
     HAS_DEPTH: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Gradients of the five parameters from ``totals``; exactly 0 for a Gaussian that touches no tile."""
+    """Store the gradients of the five parameters. They are exactly 0 for a Gaussian that touches no tile."""
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = g < n
     some = mask & (tl.load(tile_counts + g, mask=mask, other=0) > 0)

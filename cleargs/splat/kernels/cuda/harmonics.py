@@ -1,6 +1,6 @@
 """Real spherical harmonics up to degree 3 and their derivatives by the direction, in float32.
 
-All sixteen are written down; the compiler drops those that a smaller ``SH_COUNT`` never reads.
+All sixteen are computed. The compiler drops those that a smaller ``SH_COUNT`` does not read.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from cleargs.splat import constants
 
 @triton.jit
 def sh_basis(x, y, z):
-    """The 16 basis functions at the unit direction (x, y, z)."""
+    """Return the 16 basis functions at the unit direction (x, y, z)."""
     xx, yy, zz = x * x, y * y, z * z
     return (
         tl.zeros_like(x) + constants.SH_C0,
@@ -37,7 +37,7 @@ def sh_basis(x, y, z):
 
 @triton.jit
 def sh_by_x(x, y, z):
-    """Derivatives of the 16 basis functions by x, the direction taken as three free numbers."""
+    """Return the derivatives of the 16 basis functions by x. The direction is three independent numbers."""
     xx, yy, zz = x * x, y * y, z * z
     zero = tl.zeros_like(x)
     return (
@@ -62,7 +62,7 @@ def sh_by_x(x, y, z):
 
 @triton.jit
 def sh_by_y(x, y, z):
-    """Derivatives of the 16 basis functions by y."""
+    """Return the derivatives of the 16 basis functions by y."""
     xx, yy, zz = x * x, y * y, z * z
     zero = tl.zeros_like(x)
     return (
@@ -87,7 +87,7 @@ def sh_by_y(x, y, z):
 
 @triton.jit
 def sh_by_z(x, y, z):
-    """Derivatives of the 16 basis functions by z."""
+    """Return the derivatives of the 16 basis functions by z."""
     xx, yy, zz = x * x, y * y, z * z
     zero = tl.zeros_like(x)
     return (

@@ -1,13 +1,12 @@
-"""L1 + D-SSIM and its gradient in four passes over the image; the mathematics is that of the CPU back end's
-``loss``.
+"""L1 + D-SSIM and its gradient in four passes over the image.
 
-The 11 x 11 window of SSIM is separable: ``window_rows`` sums x, y, x², y² and xy along the rows, ``measure``
-sums these down the columns, which gives the similarity and its derivatives by the window means;
-``window_maps`` and ``differentiate`` send the derivatives back the same way. An image row is 3 W interleaved
-values, so neighbours in a channel are three values apart. Masked pixels are zero in both images, as are those
-beyond the border.
+The mathematics is that of the CPU back end's ``loss``. The 11 x 11 window of SSIM is separable.
+``window_rows`` sums x, y, x², y² and xy along the rows. ``measure`` sums the results along the columns, which
+gives the similarity and its derivatives by the window means. ``window_maps`` and ``differentiate`` go the
+same way with the derivatives. An image row is 3 W interleaved values, so that neighbours in a channel are
+three values apart. Masked pixels are zero in both images, as are pixels outside the image.
 
-Each program leaves its sums in float64 at a place of its own, and torch adds them in a fixed order.
+Each program stores its sums in float64 at a separate place. torch adds them in a fixed order.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ from cleargs.splat.kernels.cuda.support import memory_errors
 
 ROWS = 4
 COLUMNS = 128
-"""Rows and values of a row that a program treats."""
+"""Rows, and values per row, of one program."""
 
 
 @triton.jit
 def kept(values, mask, y, j, inside, length, HAS_MASK: tl.constexpr):
-    """Values at row y, place j, zero outside the image and where masked."""
+    """Return the values at row y, place j: zero outside the image and where masked."""
     value = tl.load(values + y * length + j, mask=inside, other=0.0)
     if HAS_MASK:
         counts = tl.load(mask + y * (length // 3) + j // 3, mask=inside, other=0)
@@ -48,7 +47,7 @@ def window_rows(
     ROWS: tl.constexpr,
     COLUMNS: tl.constexpr,
 ):
-    """Window sums of x, y, x², y² and xy along the rows: ``sums`` [5, H, length]."""
+    """Store the window sums of x, y, x², y² and xy along the rows: ``sums`` [5, H, length]."""
     y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
     i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     mean_x = tl.zeros([ROWS, COLUMNS], tl.float32)
@@ -92,7 +91,7 @@ def measure(
     ROWS: tl.constexpr,
     COLUMNS: tl.constexpr,
 ):
-    """The derivatives of SSIM by the window means ``maps`` [3, H, length], and sums [programs, 4]."""
+    """Store the derivatives of SSIM by the window means, ``maps`` [3, H, length], and sums [programs, 4]."""
     y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
     i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     here = (y < height) & (i < length)
@@ -140,7 +139,7 @@ def measure(
 
 @triton.jit(do_not_specialize=["height", "length"])
 def window_maps(maps, sums, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """Window sums of the three maps along the rows: ``sums`` [3, H, length]."""
+    """Store the window sums of the three maps along the rows: ``sums`` [3, H, length]."""
     y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
     i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     plane = height.to(tl.int64) * length
@@ -177,7 +176,7 @@ def differentiate(
     ROWS: tl.constexpr,
     COLUMNS: tl.constexpr,
 ):
-    """gradient = (l1_weight sign(x - y) + ssim_weight d(sum of SSIM)/dx) / count; 0 where masked."""
+    """Store (l1_weight sign(x - y) + ssim_weight d(sum of SSIM)/dx) / count, and 0 where masked."""
     y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
     i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     here = (y < height) & (i < length)
@@ -214,7 +213,7 @@ def loss_sums(
     ssim_weight: float,
     gradient: Tensor,
 ) -> Tensor:
-    """See ``cleargs.splat.backend.Backend``; the sums stay on the device."""
+    """See ``cleargs.splat.backend.Backend``. The sums stay on the device."""
     height, length = image.shape[0], 3 * image.shape[1]
     sums, maps = (torch.empty(planes * height * length, device=image.device) for planes in (5, 3))
     grid = (-(-length // COLUMNS), -(-height // ROWS))

@@ -1,6 +1,6 @@
 """The GPU rasteriser: projection, binning and rasterisation over reusable buffers.
 
-A forward pass waits for the device once, to learn how many (tile, splat) pairs there are; nothing else waits.
+A forward pass waits for the device once, for the number of (tile, splat) pairs. Nothing else waits.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from cleargs.splat.kernels.rasteriser import tiles_of
 from cleargs.splat.types import Render
 
 FORWARD_WARPS = 2
-"""Warps a tile forward: four pixels a lane."""
+"""Warps per tile, forward: four pixels per lane."""
 BACKWARD_WARPS = 1
-"""Warps a chunk backward: with one, the sums over pixels need shuffles only and no barrier."""
+"""Warps per chunk, backward: with one, sums over pixels need shuffles and no barrier."""
 PROJECT_BLOCK = 128
 LIST_BLOCK = 32
 ORDER_BLOCK = 1024
@@ -33,18 +33,18 @@ TOTAL_BLOCK = 16
 PAIR_BYTES = 4 * (
     4 + layout.PAIR_COLUMNS + layout.TILE_PIXELS * (device_layout.CHUNK_PLANES + 1) // device_layout.CHUNK
 )
-"""What a (tile, splat) pair takes in buffers, its share of a full chunk included."""
+"""Bytes per (tile, splat) pair in buffers, with its share of a full chunk."""
 SORT_BYTES = 24
-"""What sorting it by tile takes for a while: key and number, twice."""
+"""Bytes per pair while pairs are sorted by tile: key and number, twice."""
 
 
 @dataclass(frozen=True, eq=False)
 class CudaForwardPass(rasteriser.ForwardPass):
-    """What the backward pass needs of one forward pass."""
+    """Data that the backward pass needs from one forward pass."""
 
     view: Tensor  # float64 [23]
     background: Tensor  # [3]
-    planes: int  # planes a chunk
+    planes: int  # planes per chunk
     splats: Tensor  # [N, 16]
     tile_counts: Tensor  # [N] int32
     pair_starts: Tensor  # [N] int32, first slot of each Gaussian
@@ -60,7 +60,7 @@ class CudaForwardPass(rasteriser.ForwardPass):
 
 
 class CudaRasteriser(rasteriser.Rasteriser):
-    """Forward and backward passes on a GPU, or on the CPU under Triton's interpreter."""
+    """Forward and backward passes on a GPU, or on the CPU in Triton's interpreter."""
 
     pair_buffers = (
         *("pair_tiles", "pair_owners", "pair_ids", "pair_slots", "pair_sums"),
@@ -241,7 +241,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
             )
         tile_starts = binning.tile_starts(sorted_tiles, tiles)
         planes = device_layout.CHUNK_PLANES + depth
-        # The number of chunks is known on the device alone; this many there can be at most.
+        # Only the device knows the number of chunks. This is an upper bound.
         chunks = pairs // device_layout.CHUNK + min(tiles, pairs)
         return CudaForwardPass(
             **vars(inputs),

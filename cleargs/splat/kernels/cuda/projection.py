@@ -1,8 +1,8 @@
-"""From raw Gaussian parameters to packed splats; ``gradients`` goes the way back.
+"""Packed splats from raw Gaussian parameters. ``gradients`` is the backward pass.
 
-EWA splatting as in the CPU back end, whose ``projection`` derives the formulas: with U = J W R diag(s), its
-rows u0 and u1 and k = Σxy / Σyy, the ellipse needs s = |u0 - k u1|² + 0.3 (1 + k²) and Σyy only, and nothing
-cancels. Geometry is computed in float64, colours in float32. A lane is a Gaussian.
+EWA splatting as in the CPU back end, whose ``projection`` derives the formulas. With U = J W R diag(s), its
+rows u0 and u1, and k = Σxy / Σyy, the ellipse needs s = |u0 - k u1|² + 0.3 (1 + k²) and Σyy only, without
+cancellation. Geometry is computed in float64, colours in float32. A lane is a Gaussian.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from cleargs.splat.kernels.cuda.harmonics import sh_basis
 
 @triton.jit
 def dot(a, b):
-    """Scalar product of two triples."""
+    """Return the scalar product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @triton.jit
 def cross(a, b):
-    """Vector product of two triples."""
+    """Return the vector product of two triples."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @triton.jit
 def combine(a, x, b, y):
-    """The triple a x + b y."""
+    """Return the triple a x + b y."""
     return (a * x[0] + b * y[0], a * x[1] + b * y[1], a * x[2] + b * y[2])
 
 
 @triton.jit
 def is_finite(x):
-    """Within the range of float32; false for NaN."""
+    """Return True within the range of float32; False for NaN."""
     return tl.abs(x) <= device_layout.FLOAT32_MAX
 
 
 @triton.jit
 def load_triple(pointer, mask):
-    """Three neighbouring float32 as float64."""
+    """Return three consecutive float32 as float64."""
     return (
         tl.load(pointer, mask=mask, other=0.0).to(tl.float64),
         tl.load(pointer + 1, mask=mask, other=0.0).to(tl.float64),
@@ -53,13 +53,13 @@ def load_triple(pointer, mask):
 
 @triton.jit
 def view_triple(view, at: tl.constexpr):
-    """Three neighbouring numbers of a view."""
+    """Return three consecutive numbers of a view."""
     return (tl.load(view + at), tl.load(view + at + 1), tl.load(view + at + 2))
 
 
 @triton.jit
 def camera_position(mean, view):
-    """The Gaussian's centre in camera coordinates."""
+    """Return the Gaussian's centre in camera coordinates."""
     shift = view_triple(view, device_layout.VIEW_TRANSLATION)
     return (
         dot(view_triple(view, device_layout.VIEW_ROTATION), mean) + shift[0],
@@ -70,7 +70,7 @@ def camera_position(mean, view):
 
 @triton.jit
 def unit_quaternion(rotations, g, mask):
-    """The normalised quaternion w x y z and the norm it was divided by."""
+    """Return the normalised quaternion w x y z, and the norm."""
     w = tl.load(rotations + g * 4, mask=mask, other=1.0).to(tl.float64)
     x = tl.load(rotations + g * 4 + 1, mask=mask, other=0.0).to(tl.float64)
     y = tl.load(rotations + g * 4 + 2, mask=mask, other=0.0).to(tl.float64)
@@ -83,7 +83,7 @@ def unit_quaternion(rotations, g, mask):
 
 @triton.jit
 def rotation_columns(q):
-    """The columns of the rotation matrix of a unit quaternion."""
+    """Return the columns of the rotation matrix of a unit quaternion."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
@@ -94,7 +94,7 @@ def rotation_columns(q):
 
 @triton.jit
 def projection_rows(position, view):
-    """The rows of J W, and the bounded x/z and y/z at which J is taken."""
+    """Return the rows of J W, and the bounded x/z and y/z of J."""
     x, y, z = position[0], position[1], position[2]
     jx, jy = tl.load(view + device_layout.VIEW_FX) / z, tl.load(view + device_layout.VIEW_FY) / z
     left, right = tl.load(view + device_layout.VIEW_LEFT), tl.load(view + device_layout.VIEW_RIGHT)
@@ -109,7 +109,7 @@ def projection_rows(position, view):
 
 @triton.jit
 def scaled(factor, a):
-    """The triple times a number."""
+    """Return the triple times a number."""
     return (factor * a[0], factor * a[1], factor * a[2])
 
 
@@ -133,10 +133,10 @@ def project(
     ANTIALIAS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Packed splats [N, 16], sort keys [N] (depth, or infinity), tiles touched [N] int32 and radii [N] in px.
+    """Store packed splats [N, 16], depth keys [N], numbers of touched tiles [N] int32 and radii [N] in px.
 
-    A Gaussian is culled when it is behind the near plane, too faint, not finite or touches no tile; its key
-    is infinity, its count and its radius are 0. To be launched without contraction of multiply and add, as
+    A Gaussian is culled if it is behind the near plane, too faint, not finite, or touches no tile. Its key is
+    then infinity, its count and its radius are 0. Launch it without fused multiply and add, as
     ``binning.list_pairs``, which must find the same tiles.
     """
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -145,7 +145,7 @@ def project(
     position = camera_position(mean, view)
     z = position[2]
     visible = mask & (z >= constants.NEAR) & (z <= device_layout.FLOAT32_MAX)
-    # Culled lanes go on with harmless numbers.
+    # Culled lanes continue with harmless numbers.
     position = (position[0], position[1], tl.where(visible, z, 1.0))
     z = position[2]
     quaternion = unit_quaternion(rotations, g, mask)
@@ -189,7 +189,7 @@ def project(
     visible = visible & is_finite(red) & is_finite(green) & is_finite(blue)
 
     row = splats + g * layout.SPLAT_COLUMNS
-    # Rounded once, here: the tiles are counted from what is stored.
+    # Rounded once, here: the tiles are counted from the stored numbers.
     mean_x, mean_y = mean_x.to(tl.float32), mean_y.to(tl.float32)
     bend_x, bend_y = (
         (device_layout.HALF_LOG2E / variance).to(tl.float32),

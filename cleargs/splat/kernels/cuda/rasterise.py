@@ -1,10 +1,10 @@
-"""Tile rasterisation, forward and backward; the mathematics is that of the CPU back end's ``rasterise``.
+"""Tile rasterisation, forward and backward, with the mathematics of the CPU back end's ``rasterise``.
 
-Forward, a program is a tile: its 256 pixels are the vector, its pairs follow each other from near to far.
-Behind every ``device_layout.CHUNK`` pairs it leaves the transmittance and what the chunk added to each pixel.
-``behind`` sums these from the far end into S, the part of g · pixel that lies behind each chunk. With T and S
-at its far end each chunk can be differentiated on its own, so that backward a program is a chunk and long
-lists of pairs are shared out:
+Forward, a program is a tile. Its 256 pixels are the vector, and its pairs are blended from near to far.
+Behind every ``device_layout.CHUNK`` pairs it stores the transmittance T and the colour that the chunk added
+to each pixel. ``behind`` sums these from the far end into S, the part of g · pixel that is behind each chunk.
+T and S at its far end are all that a chunk needs for its derivatives. Backward, a program is therefore a
+chunk, and long lists of pairs are distributed over many programs:
 
     v = dL/d(ln alpha) = w (g · c) - S alpha / (1 - alpha),   0 where alpha is clamped.
 
@@ -23,9 +23,9 @@ from cleargs.splat.kernels.cuda import device_layout
 
 @triton.jit
 def splat_alpha(x, y, row):
-    """u, dy, alpha before clamp and cut, and alpha as it is blended, at pixel centres, of a packed splat.
+    """Return u, dy, alpha before clamp and cut, and blended alpha of a packed splat, at pixel centres.
 
-    Written with explicit fused operations, so that forward and backward pass agree to the bit about the cut.
+    The fused operations are explicit, so that forward and backward pass make the same cut to the bit.
     """
     dy = y - tl.load(row + layout.MEAN_Y)
     u = tl.fma(-tl.load(row + layout.SKEW), dy, x - tl.load(row + layout.MEAN_X))
@@ -55,10 +55,10 @@ def forward(
     WITH_DEPTH: tl.constexpr,
     PLANES: tl.constexpr,
 ):
-    """One tile of image [H, W, 3], alpha, transmittance, last contributor (from 1) and depth [H, W].
+    """Store one tile of image [H, W, 3], alpha, transmittance, last contributor (from 1) and depth [H, W].
 
-    For the backward pass also the planes of its chunks [C, PLANES, 256], the tile of each chunk and the
-    number of the tile's last contributor.
+    Also store, for the backward pass, the planes of its chunks [C, PLANES, 256], the tile of each chunk, and
+    the number of the tile's last contributor.
     """
     tile = tl.program_id(0)
     tiles_x = (width + layout.TILE - 1) // layout.TILE
@@ -75,7 +75,7 @@ def forward(
         number = first + pixel
         tl.store(chunk_tiles + chunk + number, tl.zeros_like(pixel) + tile, mask=number < chunks)
 
-    # `live` is T while the pixel goes on and 0 from then on (or outside the image); `rest` keeps T.
+    # `live` is T until the pixel stops, then 0 (also outside the image). `rest` keeps T.
     live = tl.where(inside, 1.0, 0.0)
     rest = tl.zeros_like(x) + 1.0
     deep = tl.zeros_like(pixel)
@@ -93,7 +93,7 @@ def forward(
         chunk_z = tl.zeros_like(x)
         following = tl.load(pair_ids + start)
         for place in range(start, stop):
-            # The next number is asked for early: what hangs on it waits for memory only once.
+            # The next number is loaded early: the loads that depend on it wait for memory only once.
             g = following
             following = tl.load(pair_ids + tl.minimum(place + 1, stop - 1))
             row = splats + g.to(tl.int64) * layout.SPLAT_COLUMNS
@@ -154,7 +154,7 @@ def behind(
     HAS_DEPTH: tl.constexpr,
     PLANES: tl.constexpr,
 ):
-    """S behind every chunk of a tile that contributes, [C, 256]: g · all that lies behind it."""
+    """Store S, g · all that is behind, for every chunk of a tile that contributes: [C, 256]."""
     tile = tl.program_id(0)
     tiles_x = (width + layout.TILE - 1) // layout.TILE
     pixel = tl.arange(0, layout.TILE_PIXELS)
@@ -205,9 +205,9 @@ def backward(
     PLANES: tl.constexpr,
     COLUMNS: tl.constexpr,
 ):
-    """The sums of every pair of one chunk, at the rows of ``pair_sums`` [P, 10] that are the pairs' slots.
+    """Store the sums of every pair of one chunk, in the rows of ``pair_sums`` [P, 10] at the pairs' slots.
 
-    Programs beyond the last chunk do nothing: the launch only knows a bound on the number of chunks.
+    Programs after the last chunk do nothing: the launch knows only an upper bound of the number of chunks.
     """
     chunk = tl.program_id(0)
     if chunk < tl.load(chunk_starts + tiles):
@@ -266,7 +266,7 @@ def backward_chunk(
     HAS_DEPTH: tl.constexpr,
     PLANES: tl.constexpr,
 ):
-    """Walk the places ``end`` - 1 down to ``start`` and store each pair's sums."""
+    """Visit the places ``end`` - 1 down to ``start`` and store each pair's sums."""
     tiles_x = (width + layout.TILE - 1) // layout.TILE
     pixel = tl.arange(0, layout.TILE_PIXELS)
     column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE

@@ -1,10 +1,11 @@
-"""Whether the GPU back end can run here, and what its failures mean."""
+"""Requirements of the GPU back end, and the errors of a GPU."""
 
 from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
+from subprocess import CalledProcessError
 
 import torch
 
@@ -13,12 +14,12 @@ from cleargs.splat.kernels import memory
 
 
 def on_gpu(device: torch.device) -> bool:
-    """Whether the GPU kernels serve tensors on ``device``; the one question that every dispatch asks."""
+    """Return True if the GPU kernels serve tensors on ``device``. Every dispatch calls this function."""
     return device.type == "cuda"
 
 
 def require(device: torch.device) -> None:
-    """Raise InputError when the kernels cannot run on ``device``."""
+    """Raise InputError if the kernels cannot run on ``device``."""
     if importlib.util.find_spec("triton") is None:
         raise InputError(
             "the GPU kernels need Triton, which is not installed",
@@ -33,8 +34,8 @@ def require(device: torch.device) -> None:
 
 
 def available_memory(device: torch.device) -> int:
-    """Bytes that tensors on ``device`` may still take: what is free there and what torch keeps for later."""
-    if device.type != "cuda":  # the interpreter's tensors
+    """Return the free bytes on ``device``, with those that torch reserves and does not use."""
+    if device.type != "cuda":  # tensors of the interpreter
         return memory.available_memory()
     free, _ = torch.cuda.mem_get_info(device)
     kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
@@ -43,7 +44,7 @@ def available_memory(device: torch.device) -> int:
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turn an exhausted device memory into a StageError that says what to change."""
+    """Turn an error about full GPU memory into a StageError that says what to change."""
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
@@ -51,3 +52,29 @@ def memory_errors() -> Iterator[None]:
             f"the GPU's memory is full: {str(error).splitlines()[0]}",
             hint="lower g0.budget, cache_mb or ingest.max_size and run again: the last checkpoint is kept",
         ) from error
+
+
+def gpu_fault(error: BaseException | None) -> str | None:
+    """Return in one line what the GPU, its driver or a library on it reported; None for any other error.
+
+    The causes of ``error`` are searched too.
+    """
+    while error is not None:
+        line = (str(error).strip().splitlines() or [""])[0]
+        if isinstance(error, torch.cuda.OutOfMemoryError):
+            return f"the GPU's memory is full: {line}"
+        if "driver" in line and "too old" in line:
+            return f"the NVIDIA driver is too old for this PyTorch (CUDA {torch.version.cuda})"
+        if "no NVIDIA driver" in line:
+            return "PyTorch finds no NVIDIA driver"
+        # Triton compiles a small library in C when it first sees a GPU.
+        if "find C compiler" in line:
+            return "Triton needs a C compiler: install gcc or clang"
+        if isinstance(error, CalledProcessError) and "cuda_utils" in line:
+            return "Triton's C compiler failed: the headers of Python (python3-dev) may be missing"
+        library = type(error).__module__.split(".")[0]
+        from_cuda = "CUDA" in str(error) and (library == "onnxruntime" or isinstance(error, RuntimeError))
+        if library == "triton" or from_cuda:
+            return f"{type(error).__name__}: {line}"
+        error = error.__cause__ or error.__context__
+    return None

@@ -1,0 +1,52 @@
+"""The self-test in Triton's interpreter, small and perhaps with a fault: `python self_test_child.py FAULT`.
+
+``pass`` runs all checks. ``hang`` and ``crash`` plant a kernel that does so into the check of the loss.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+
+os.environ["TRITON_INTERPRET"] = "1"  # before Triton is imported
+
+from cleargs.splat.kernels.cuda import backend, self_test
+from cleargs.splat.kernels.cuda.self_test import Sizes, View
+
+SMALL = Sizes(
+    views={
+        "a small view": View(20, 18, 17, 3.0, all_outputs=True),
+        "long tile lists": View(150, 16, 16, 6.0, faint=True),
+        "a large view": View(150, 40, 20, 2.0),
+    },
+    image=(6, 50),
+    refined=2000,
+    timed=View(20, 16, 16),
+    repeats=4,
+)
+
+ONE_CHECK = SMALL._replace(views={}, refined=40)
+"""Without the rendering, which takes most of the time in the interpreter."""
+
+
+def hang(*given: object, **options: object) -> None:
+    """Never return, as a kernel that hangs."""
+    time.sleep(3600)
+
+
+def crash(*given: object, **options: object) -> None:
+    """End the process, as a driver that crashes."""
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def main() -> None:
+    fault = sys.argv[1]
+    if fault != "pass":
+        backend.loss_sums = {"hang": hang, "crash": crash}[fault]
+    self_test.main("cpu", SMALL if fault == "pass" else ONE_CHECK)
+
+
+if __name__ == "__main__":
+    main()
