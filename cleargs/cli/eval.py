@@ -52,7 +52,7 @@ Examples:
 
 \b
 DIR holds images/ and transforms.json in the world of the capture. The result of a run is written into
-RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet beside it; those of other
+RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet next to it. Results of other
 stages and options stay there as long as their scenes do.
 """
 )
@@ -213,10 +213,10 @@ def _older(run: Path, path: Path) -> Report:
 
 
 def _seen_before(report: Report) -> str:
-    """Return a line with the number of views whose frames a scene was trained on; "" for none."""
+    """Return a line with the number of views that show frames of a training; "" for none."""
     scenes = [found for found in report.evaluations if found.scene is not None]
     if any(found.trained_on is None for found in scenes):
-        return "note: which frames the scene was trained on is not known"
+        return "note: the frames of the scene's training are not known"
     seen = [found for found in scenes if found.trained_on]
     if not seen:
         return ""
@@ -240,7 +240,7 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
         return {target.name: target}
     if not (target / RUN_FILE).is_file():
         raise InputError(
-            f"{target} is no run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
+            f"{target} is not a run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
         )
     if "all" in stages:
         chosen = [name for name in dag.names if (target / name / SCENE).is_file()]
@@ -294,7 +294,7 @@ def _provenance(evaluation: Evaluation) -> str:
 
 
 def _regions(evaluation: Evaluation) -> str:
-    """Where scenes fail that look well on average."""
+    """Return a line on regions in which scenes often fail."""
     parts = {"behind the sparse points": evaluation.far, "clipped in the references": evaluation.clipped}
     words = (
         f"{name} {part.share:.1%} of the pixels, {_figure('psnr', part.psnr)} dB"

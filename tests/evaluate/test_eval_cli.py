@@ -136,7 +136,7 @@ def test_views_of_frames_that_were_trained_on_are_told_from_others(
     _, out, _ = shell(run, "--reference", novel, *FAST)
     assert "trained on" not in out
     _, out, _ = shell(run / "g0" / "scene.ply", "--reference", truth, *FAST)
-    assert out.startswith("note: which frames the scene was trained on is not known\n")
+    assert out.startswith("note: the frames of the scene's training are not known\n")
 
 
 def test_an_evaluation_stays_beside_those_of_other_stages_and_options(
