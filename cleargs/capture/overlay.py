@@ -26,7 +26,7 @@ _MOVES = 10.0
 _EDGE = 40.0
 """Sobel response of the mean picture, levels per pixel times 4, from which a pixel has structure."""
 
-_SHARE = 0.0003, 0.5
+_SHARE = 0.002, 0.5
 """Least and largest share of still structure. Above, the camera stands; below, it is a chance."""
 
 

@@ -268,7 +268,7 @@ def test_a_stretch_without_frames(tmp_path: Path, settings: dict[str, Any], word
 
 
 def test_photographs_have_no_stretch(images: Path) -> None:
-    with pytest.raises(InputError, match="no video"):
+    with pytest.raises(InputError, match="not a video"):
         open_capture(images, IngestConfig(start=1))
 
 
