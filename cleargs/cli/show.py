@@ -79,13 +79,13 @@ SOURCES = {
 """Input of the expert -> its name."""
 
 SCORES = {
-    "R": "reliable appearance",
+    "R": "reliability",
     "B": "risk of degradation",
     "G": "geometric utility",
-    "C": "coverage gained",
-    "D": "new directions",
-    "O": "overlap with reliable frames",
-    "Z": "centrality in its section",
+    "C": "coverage gain",
+    "D": "pose diversity",
+    "O": "redundancy",
+    "Z": "centrality in its bin",
 }
 """Score of RVA -> its meaning."""
 
