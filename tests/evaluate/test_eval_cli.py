@@ -186,7 +186,9 @@ def test_a_run_without_held_out_frames(shell: Shell, tmp_path: Path) -> None:
 
 def test_not_a_splat(shell: Shell, truth: Path, tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
-    fails(shell(tmp_path / "mesh.ply", "--reference", truth, *FAST), "mesh.ply", "is not a scene of Gaussians")
+    fails(
+        shell(tmp_path / "mesh.ply", "--reference", truth, *FAST), "mesh.ply", "is not a scene of Gaussians"
+    )
     fails(shell(truth / "images" / "000.png", "--reference", truth, *FAST), "is not a scene of Gaussians")
 
 
