@@ -18,7 +18,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 
 
 class IngestConfig(SfmConfig, CaptureConfig):
-    """How a capture becomes undistorted frames with poses and sparse points."""
+    """Settings of ingest: from a capture to undistorted frames with poses and sparse points."""
 
     max_size: int = Field(
         960,
@@ -68,36 +68,36 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update=limits)
 
 
-VERSION = 8
+VERSION = 9
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
 LEFTOVERS = ("images/*.png",)
-LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "numpy", "scipy")
+LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "pillow", "numpy", "scipy")
 
-# Wall seconds on two cores: a frame's features, fixed and a megapixel; a pair's matches, fixed and a square
-# megapixel, since each feature is compared with each; of at most so many features a megapixel.
+# Wall seconds on two cores: features per frame, fixed and per megapixel; matches per pair, fixed and per
+# square megapixel, because each feature is compared with each other; most features per megapixel.
 _FEATURES_S, _FEATURES_S_PER_MEGAPIXEL = 0.015, 0.7
 _PAIR_S, _PAIR_S_PER_SQUARE_MEGAPIXEL = 0.0025, 0.15
 _FEATURES_PER_MEGAPIXEL = 7000
-# And of one core: until COLMAP's process is there; then a megapixel of a frame, to read and undistort it, to
+# Seconds of one core: start of COLMAP's process; per megapixel of a frame, to read and undistort it, and to
 # map it without and with a pose.
 _START_S = 1.0
-_FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 0.85, 0.2
+_FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 1.3, 0.2
 
 
 def externals(config: IngestConfig, source: Path) -> Mapping[str, External]:
-    """The files and folders of the capture that are read."""
+    """Return the files and folders of the capture that are read."""
     return capture_externals(source, config)
 
 
 def preflight(config: IngestConfig) -> None:
-    """It needs no model."""
+    """Do nothing: ingest needs no model."""
 
 
 def estimate(context: StageContext[IngestConfig]) -> Estimate:
-    """From the number of frames, their size, and the number of pairs to match."""
+    """Estimate the cost from the number of frames, their size, and the number of pairs to match."""
     from cleargs.capture.prepare import reduced_size
     from cleargs.capture.sources import frame_size, open_capture
 
@@ -149,6 +149,8 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         f"{len(capture.frames)} of {capture.n_available} frames ({capture.kind}), "
         f"long side at most {config.max_size} px"
     )
+    for note in capture.notes:
+        reporter.warn(note)
     if capture.hdr is not None:
         reporter.warn(
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
@@ -165,13 +167,18 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         lambda index: read_rgb(work / "images" / frames[index].image),
         [frame.image in registered for frame in frames],
     )
+    if config.holdout == "none":
+        test = {index for index, frame in enumerate(frames) if frame.source.test}
     outcome = scene.outcome
     model = publish(frames, scene.model, outcome.placed, test, work, context.out, config.max_size, reporter)
     return StageResult(
         summary={
             "kind": capture.kind,
-            "poses": ("refined" if outcome.refined else "input") if capture.posed else "sfm",
+            "poses": {"given": "input", "adjusted": "refined", "sfm": "sfm"}[outcome.method],
             "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
+            "pose_convention": outcome.convention if capture.posed else None,
+            "kept_out_matches_off_px": {name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
+            "lens": outcome.lens or None,
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),

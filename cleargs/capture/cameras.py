@@ -1,8 +1,8 @@
-"""Cameras and poses, in COLMAP's conventions, and the normalised world: origin at the mean camera centre,
-farthest camera at distance 1, mean up along -y.
+"""Cameras and poses in COLMAP's conventions, and the normalised world.
 
-Distortion is pycolmap's (all COLMAP models). Only its camera mathematics is called in this process, on
-parameters that were checked: COLMAP's failed checks would end the process.
+The normalised world has its origin at the mean camera centre, the farthest camera at distance 1, and the mean
+up direction along -y. Distortion is pycolmap's (all COLMAP models). Only its camera mathematics is called in
+this process, on checked parameters, because COLMAP's failed checks would end the process.
 """
 
 from __future__ import annotations
@@ -31,17 +31,22 @@ TWO_FOCALS = frozenset({"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "T
 """Models with two: fx, fy, cx, cy, ..."""
 
 MAX_PARAMETER, MIN_FOCAL = 1e9, 1e-3
-"""Largest size of a camera's numbers, and shortest focal length, px: beyond them pixels and rays overflow."""
+"""Largest camera parameter, and shortest focal length in pixels. Beyond them pixels and rays overflow."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 MAX_COORDINATE = 1e100
-"""Of a pose as given, in its own units: distances beyond it overflow when they are squared."""
+"""Largest coordinate of a given pose, in the input's units. Larger distances overflow when they are
+squared."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics in pixels of an image of ``width`` x ``height``; the centre of the first pixel is 0.5."""
+    """Intrinsics in pixels of an image of ``width`` x ``height``. The centre of the first pixel is 0.5.
+
+    Raises:
+        InputError: an unknown model, or parameters that no lens has.
+    """
 
     model: str
     width: int
@@ -74,23 +79,23 @@ class Intrinsics:
 
     @property
     def focal(self) -> tuple[float, float]:
-        """fx, fy."""
+        """Focal lengths fx and fy, px."""
         return (self.params[0],) * 2 if self.model in SINGLE_FOCAL else (self.params[0], self.params[1])
 
     @property
     def centre(self) -> tuple[float, float]:
-        """cx, cy."""
+        """Principal point cx and cy, px."""
         start = 1 if self.model in SINGLE_FOCAL else 2
         return self.params[start], self.params[start + 1]
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether the image needs no undistortion."""
+        """Return True if the image needs no undistortion."""
         distortion = self.params[3:] if self.model in SINGLE_FOCAL else self.params[4:]
         return not any(distortion) and not self.model.endswith("FISHEYE") and self.model != "FOV"
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The camera of the same picture scaled to another size."""
+        """Return the camera of the same image scaled to another size."""
         if (width, height) == (self.width, self.height):
             return self
         camera = self.colmap()
@@ -138,6 +143,19 @@ class Pose:
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat(canonical=True)
         return float(w), float(x), float(y), float(z)
 
+    def with_flipped_axes(self) -> Pose:
+        """Return the pose that an OpenGL camera-to-world matrix has if its axes are meant as OpenCV's."""
+        rotation = _FLIP @ self.rotation
+        return Pose(rotation, -rotation @ self.centre)
+
+    def inverted(self, *, flip: bool) -> Pose:
+        """Return the pose that an OpenGL camera-to-world matrix has if it is meant as world to camera.
+
+        With ``flip`` its axes are OpenGL's, else OpenCV's.
+        """
+        rotation, translation = self.rotation.T @ _FLIP, self.centre
+        return Pose(_FLIP @ rotation, _FLIP @ translation) if flip else Pose(rotation, translation)
+
     @staticmethod
     def from_quaternion(wxyz: NDArray[np.float64], translation: NDArray[np.float64]) -> Pose:
         w, x, y, z = wxyz
@@ -150,11 +168,19 @@ def within_reach(numbers: NDArray[np.float64]) -> bool:
 
 
 def rigid_pose(camera_to_world: NDArray[np.float64], name: str, hint: str) -> Pose:  # [3 or 4, 4]
-    """The pose of frame ``name`` from a camera-to-world matrix with OpenGL axes (x right, y up, z back).
+    """Return the pose of a camera-to-world matrix with OpenGL axes (x right, y up, z back).
 
-    Printed poses are orthonormal to a few digits only, and some writers leave a scale in: the nearest
-    rotation is taken. Raises InputError with ``hint`` for NaN, what is out of reach, a mirror image, or a
-    matrix whose axes differ by more than 5 % in length.
+    Printed poses are orthonormal to a few digits only, and some writers leave a scale in. The nearest
+    rotation is taken.
+
+    Args:
+        camera_to_world: matrix [3 or 4, 4] in the input's units.
+        name: name of the frame, for the error.
+        hint: remedy, for the error.
+
+    Raises:
+        InputError: NaN, a coordinate above `MAX_COORDINATE`, a mirror image, or axes whose lengths differ by
+            more than 5 %.
     """
     if not within_reach(camera_to_world):
         raise InputError(f"the pose of {name} is not finite, or out of reach", hint=hint)
@@ -174,19 +200,24 @@ class Similarity:
     scale: float
 
     def points(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 3]
-        """Points of the input's world in the normalised one."""
+        """Return points of the input's world in the normalised world."""
         moved: NDArray[np.float64] = (xyz - self.origin) @ self.rotation.T / self.scale
         return moved
 
     def pose(self, pose: Pose) -> Pose:
-        """The same camera, world to camera, in the normalised world."""
+        """Return the same camera, world to camera, in the normalised world."""
         rotation = pose.rotation @ self.rotation.T
-        # From the centre, not from the translation: at world offsets of 1e6 the difference of two large
-        # numbers has to be taken once, between centre and origin.
+        # The centre is used, not the translation: at world offsets of 1e6 the difference of two large numbers
+        # must be taken only once, between centre and origin.
         return Pose(rotation, -rotation @ self.points(pose.centre[None])[0])
 
+    def then(self, after: Similarity) -> Similarity:
+        """Return the similarity that does this one, then ``after``."""
+        origin = self.origin + self.scale * self.rotation.T @ after.origin
+        return Similarity(after.rotation @ self.rotation, origin, self.scale * after.scale)
+
     def to_json(self) -> dict[str, Any]:
-        """The way back to the input's world, for ``manifest.json``."""
+        """Return the similarity back to the input's world, for ``manifest.json``."""
         return {
             "definition": "x_input = scale * rotation @ x_normalised + translation",
             "scale": self.scale,
@@ -198,7 +229,8 @@ class Similarity:
     def from_json(noted: Any, ingest: Path) -> Similarity:
         """Return what `to_json` wrote into the manifest of the finished folder ``ingest``.
 
-        Raises InputError when it does not.
+        Raises:
+            InputError: the manifest has no such similarity.
         """
         try:
             return Similarity(
@@ -213,16 +245,17 @@ class Similarity:
 
 
 def normalise(poses: Sequence[Pose]) -> Similarity:
-    """The similarity that normalises the world of these cameras.
+    """Return the similarity that normalises the world of these cameras.
 
-    Raises InputError when all of them stand at one place.
+    Raises:
+        InputError: all cameras are at one place.
     """
     centres = np.stack([pose.centre for pose in poses])
     origin = centres[0] + (centres - centres[0]).mean(axis=0)
     scale = float(np.linalg.norm(centres - origin, axis=1).max())
     if scale <= 1e-9 * max(1e-300, float(np.abs(centres).max())):
         raise InputError(
-            "all cameras stand at the same place: there is nothing to triangulate",
+            "all cameras are at the same place: no point can be triangulated",
             hint="the camera must move, not only turn; check the poses, or set ingest.poses=sfm",
         )
     up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
@@ -230,8 +263,10 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
 
 
 def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest rotation that takes ``up`` to -y; from nearly +y, the smallest after half a turn about x
-    (there the smallest rotation's axis hangs on rounding errors).
+    """Return the smallest rotation that takes ``up`` to -y.
+
+    Near +y, the axis of the smallest rotation depends on rounding errors. There a half turn about x comes
+    first.
     """
     length = float(np.linalg.norm(up))
     if length < 1e-6:

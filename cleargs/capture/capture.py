@@ -1,4 +1,4 @@
-"""Types of a capture: its frames in order, the cameras and poses that the input brings, and its layout."""
+"""Types of a capture: its frames in order, the cameras and poses of the input, and its layout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """One frame as the input has it."""
+    """One frame of the input."""
 
     name: str
     path: Path
@@ -28,6 +28,8 @@ class SourceFrame:
     mask: Path | None = None
     camera: Intrinsics | None = None
     pose: Pose | None = None
+    test: bool = False
+    """True if the input names it as a test view."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class Capture:
     """The chosen frames of an input, in trajectory order."""
 
     kind: str
-    """video, images, colmap, llff, transforms, or what the layout of another package says."""
+    """``video``, ``images``, ``colmap``, ``llff``, ``transforms``, or the name of another package's
+    layout."""
     frames: tuple[SourceFrame, ...]
     n_available: int
     """Frames in the input, before choosing."""
@@ -43,32 +46,41 @@ class Capture:
     """The sparse model of a COLMAP project, where it has points."""
     hdr: str | None = None
     """``pq`` or ``hlg`` for an HDR video, which is tone-mapped."""
+    stretch: tuple[float | None, float | None] = (None, None)
+    """Start and end of the part of each video that is used, s. None: the first frame, the last frame."""
+    notes: tuple[str, ...] = ()
+    """Remarks on how the input was read, which are shown as warnings."""
 
     @property
     def posed(self) -> bool:
+        """Return True if any frame has a pose."""
         return any(frame.pose is not None for frame in self.frames)
 
 
 class Layout(Protocol):
-    """Reader of one kind of input; a module, say.
+    """Reader of one kind of input, for example a module.
 
-    Another package's layout is taken by name and needs no ``detect``.
+    A layout of another package is chosen by name and needs no ``detect``.
     """
 
     def detect(self, source: Path, *, poses: bool) -> bool:
         """Return True if the input at ``source`` has this layout.
 
-        Looks at names only; without ``poses``, files of poses count for nothing.
+        Looks at names only. Without ``poses``, files of poses do not count.
         """
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:
-        """Role -> file, folder, or single files by name: all that is read.
+        """Return all files that are read, by role: a file, a folder, or single files by name.
 
-        Looks at names only and imports nothing heavy: the runner asks this of every run, also of one with
-        nothing to do. A missing input is left to `open_capture` to name.
+        Looks at names only and imports nothing heavy, because the runner calls it for every run, even if
+        there is nothing to do. `open_capture` reports a missing input.
         """
 
     def open_capture(self, source: Path, config: CaptureConfig) -> Capture:
-        """The frames in trajectory order, at most ``config.max_frames``, with what is known of cameras and
-        poses. Decodes no frame; changes nothing. Raises InputError.
+        """Return at most ``config.max_frames`` frames in trajectory order, with known cameras and poses.
+
+        Decodes no frame and changes nothing.
+
+        Raises:
+            InputError: the input is damaged or incomplete.
         """

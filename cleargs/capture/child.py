@@ -1,9 +1,9 @@
 """Work in a child process that reports progress, can be killed, and may abort without taking us along.
 
-The child writes JSON objects, one a line, to its standard output: ``{"phase": label, "total": n}`` opens
-a phase, ``{"done": k}`` moves it, ``{"error": cause, "hint": remedy}`` ends in failure. Its standard error
-(COLMAP's log) goes to a file. It and the processes that it started die with its parent: it watches its
-standard input, whose other end closes when the parent is gone, however it went.
+The child writes JSON objects, one per line, to its standard output. ``{"phase": label, "total": n}`` opens a
+phase, ``{"done": k}`` advances it, ``{"error": cause, "hint": remedy}`` reports a failure. Its standard error
+(COLMAP's log) goes to a file. The child and the processes that it started end with its parent: it watches its
+standard input, whose other end closes when the parent ends for any reason.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _FULL = 8 * 2**20
 def reports_to_parent() -> Callable[..., None]:
     """Take standard output for reports alone, and return the function that sends one, given by name.
 
-    Whatever a library prints goes to the log instead. From now on the group of this process dies when its
-    parent does.
+    Other output of libraries goes to the log. From now on the group of this process ends when its parent
+    ends.
     """
     reports = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
@@ -111,7 +111,7 @@ def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | No
 
 
 def _last_failure(log: Path) -> str:
-    """The line that says why: COLMAP's last failed check, else the last line of the log."""
+    """Return the cause of a failure: COLMAP's last failed check, else the last line of the log."""
     lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines()]
     lines = [line for line in lines if line and not line.startswith(("@", "***"))]
     checks = [line for line in lines if re.match(r"F\d{8} ", line)]

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.capture import Capture
+from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.layouts.video import video_frame
 from cleargs.capture.prepare import reduced
 from cleargs.errors import InputError
@@ -30,26 +30,45 @@ _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 
 
 def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> Capture:
-    """``capture`` with each frame of a video exchanged for the sharpest of those that are nearer to its time
-    than to the time of another chosen frame; ties go to the earlier one.
+    """Return ``capture`` with each frame of a video exchanged for the sharpest of its stretch of time.
 
-    The video is decoded once, unless a killed run left its choice in ``folder``.
+    The stretch of a frame is all frames of its video that are nearer to its time than to the time of another
+    chosen frame. Ties go to the earlier one. Each video is decoded once, unless a killed run left its choice
+    in ``folder``.
     """
     if capture.kind != "video":
         return capture
-    source = capture.frames[0].path
-    timeline = read_timeline(source)
-    times = np.array([frame.pts for frame in capture.frames], np.float64)
+    videos = list(dict.fromkeys(frame.path for frame in capture.frames))
+    frames: list[SourceFrame] = []
+    for number, video in enumerate(videos):
+        ours = [frame for frame in capture.frames if frame.path == video]
+        file = folder / (CHOICE if number == 0 else f"{number}-{CHOICE}")
+        frames += _sharpest_of(video, ours, capture.stretch, file, long_side, reporter)
+    same = all(one is two for one, two in zip(frames, capture.frames, strict=True))
+    return capture if same else replace(capture, frames=tuple(frames))
+
+
+def _sharpest_of(
+    video: Path,
+    frames: Sequence[SourceFrame],
+    stretch: tuple[float | None, float | None],
+    file: Path,
+    long_side: int,
+    reporter: Reporter,
+) -> Sequence[SourceFrame]:
+    """Return the sharpest frames near these of one video; ``file`` keeps their numbers for a killed run."""
+    timeline = read_timeline(video).between(*stretch)
+    times = np.array([frame.pts for frame in frames], np.float64)
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, timeline.pts)
     if len(nearest) == len(times):
-        return capture
-    chosen = _saved_choice(folder / CHOICE, nearest, len(times))
+        return frames
+    chosen = _saved_choice(file, nearest, len(times))
     if chosen is None:
         best = np.full(len(times), -1.0)
         chosen = [0] * len(times)
         numbers = {pts: number for number, pts in enumerate(timeline.pts)}
         with reporter.task("looking for sharp frames", len(numbers)) as task:
-            for pts, grey in decode_grey(source, numbers):
+            for pts, grey in decode_grey(video, numbers):
                 number = numbers[pts]
                 place, value = nearest[number], sharpness(reduced(grey, long_side))
                 if value > best[place]:
@@ -57,15 +76,16 @@ def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter
                 task.advance()
         if (best < 0.0).any():
             raise InputError(
-                f"{source.name}: of a stretch of it no frame can be decoded",
+                f"{video.name}: of a stretch of it no frame can be decoded",
                 hint="convert the video with ffmpeg, or cut the damaged part off",
             )
-        write_json(folder / CHOICE, chosen)
-    return replace(capture, frames=tuple(video_frame(source, timeline, number) for number in chosen))
+        write_json(file, chosen)
+    prefix = frames[0].name.rpartition("_")[0]
+    return [video_frame(video, timeline, number, prefix) for number in chosen]
 
 
 def _saved_choice(file: Path, nearest: NDArray[np.intp], count: int) -> list[int] | None:
-    """The choice of a killed run, or None where there is none that fits."""
+    """Return the choice of a killed run, or None if there is none that fits."""
     try:
         chosen = [int(number) for number in read_json(file)]
         return chosen if nearest[chosen].tolist() == list(range(count)) else None
@@ -91,13 +111,21 @@ def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
 def held_out(
     rule: str, names: Sequence[str], read: Callable[[int], ImageU8], registered: Sequence[bool]
 ) -> set[int]:
-    """Indices of the test frames by ``ingest.holdout``; ``read`` gives frame i as RGB (for sharpest:N only).
+    """Return the numbers of the test frames by ``ingest.holdout``.
 
-    every:N holds out frames 0, N, 2N, ... (as Mip-NeRF 360 and 3DGS do with N = 8); sharpest:N the sharpest
-    of every N registered frames in a row, also of the shorter rest (3dgs-deblur's
-    ``train_eval_split_by_blur_score.py`` with N = 8, which has its blur scores from the recording), so that
-    tests are both clean and spread over the capture; ties go to the earlier frame.
-    Raises InputError for unknown names, and when no registered frame is left for training.
+    every:N holds out frames 0, N, 2N, ..., as Mip-NeRF 360 and 3DGS do with N = 8. sharpest:N holds out the
+    sharpest of every N registered frames in a row, also of the shorter rest, as 3dgs-deblur's
+    ``train_eval_split_by_blur_score.py`` does with N = 8 and blur scores of the recording. Tests are then
+    sharp and spread over the capture. Ties go to the earlier frame.
+
+    Args:
+        rule: the setting.
+        names: names of the frames.
+        read: returns frame i as RGB, for sharpest:N.
+        registered: true for each frame with a pose.
+
+    Raises:
+        InputError: unknown names, or no registered frame is left for training.
     """
     kind, _, number = rule.partition(":")
     if rule == "none":

@@ -1,7 +1,7 @@
 """pycolmap, without the signal handler that importing it installs.
 
-Its glog catches SIGTERM, prints a stack trace and dies of the signal. Whoever imports pycolmap does it
-through here, so that SIGTERM stays what the program made of it.
+Its glog catches SIGTERM, prints a stack trace and ends the process. All modules import pycolmap from here, so
+that the program's own handler of SIGTERM stays.
 """
 
 from __future__ import annotations
@@ -14,5 +14,5 @@ import pycolmap
 __all__ = ["pycolmap"]
 
 if threading.current_thread() is threading.main_thread():  # Python sets signal handlers nowhere else
-    # glog changed the handler behind Python's back: what Python remembers is the one before.
+    # glog changed the handler without Python, which still knows the one before.
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)

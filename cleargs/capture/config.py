@@ -1,4 +1,4 @@
-"""Settings of the functions here. The stage's own, `cleargs.stages.ingest`, inherits them."""
+"""Settings of this package. Those of the stage, `cleargs.stages.ingest`, inherit them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 from cleargs.base_model import FrozenModel
 from cleargs.plugins import require_known
 
-SfmModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+SfmModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 
 class CaptureConfig(FrozenModel):
@@ -25,12 +25,18 @@ class CaptureConfig(FrozenModel):
     max_frames: int = Field(
         150,
         ge=3,
-        description="most frames to take, evenly; of a video, the sharpest nearby",
+        description="most frames to take, evenly; in a video, the sharpest nearby",
+    )
+    start: float | None = Field(
+        None, ge=0, description="take a video from this time on, s; unset: from its first frame on"
+    )
+    end: float | None = Field(
+        None, gt=0, description="take a video up to this time, s; unset: up to its last frame"
     )
     layout: str = Field(
         "auto",
-        json_schema_extra={"key": False, "plugin": "layouts"},  # what is read in consequence is in the key
-        description="how the input is read; auto: by what lies in it; or one that another package brings",
+        json_schema_extra={"key": False, "plugin": "layouts"},  # the files that are read are in the key
+        description="reader of the input; auto: chosen by the files in it; or a layout of another package",
     )
     poses: Literal["auto", "sfm"] = Field(
         "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
@@ -48,17 +54,19 @@ class SfmConfig(FrozenModel):
     refine_above: float = Field(
         0.6,
         ge=0,
-        description="the input's poses are adjusted to the images where, at these poses, the features miss "
-        "their points by more than this many pixels (median), and at the adjusted ones by at most half",
+        description="poses and cameras of the input are adjusted to the images, or found again, if features "
+        "miss their points by more than this many pixels (median) at the input's poses",
     )
     camera_model: SfmModel = Field(
-        "SIMPLE_RADIAL", description="COLMAP camera model that SfM fits when the input brings no cameras"
+        "auto",
+        description="COLMAP camera model that SfM fits; auto: SIMPLE_RADIAL, or OPENCV where that explains "
+        "matches better that took no part in fitting it",
     )
     shared_camera: bool = Field(
-        True, description="SfM: one camera for all frames of a size; false: a camera a frame"
+        True, description="SfM: one camera for all frames of one size and lens; false: a camera per frame"
     )
     max_features: int = Field(
-        4096, ge=256, le=65536, description="SIFT features a frame, the largest scales first"
+        4096, ge=256, le=65536, description="SIFT features per frame, the largest scales first"
     )
     exhaustive_below: int = Field(
         60,

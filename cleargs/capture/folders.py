@@ -10,14 +10,16 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from cleargs.capture.capture import External, SourceFrame
-from cleargs.media import IMAGE_SUFFIXES
+from cleargs.errors import InputError
+from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 
 T = TypeVar("T")
 
 
 def image_folders(root: Path) -> list[Path]:
-    """``images/`` and its reductions ``images_N/`` (N times smaller, as LLFF and nerfstudio name them),
-    largest images first; empty when ``root`` has none of them.
+    """Return ``images/`` and its reductions ``images_N/`` below ``root``, the largest images first.
+
+    LLFF and nerfstudio name images that are N times smaller so.
     """
     found = [(0, root / "images")] if (root / "images").is_dir() else []
     for folder in root.glob("images_*"):
@@ -28,8 +30,9 @@ def image_folders(root: Path) -> list[Path]:
 
 
 def image_files(folder: Path, *, below: bool = False) -> list[Path]:
-    """The images in ``folder``, with ``below`` also those in its folders, but none that is hidden; in any
-    order.
+    """Return the images in ``folder``, in any order, without hidden ones.
+
+    ``below`` includes those in its subfolders.
     """
     found = folder.rglob("*") if below else folder.iterdir()
     return [
@@ -39,6 +42,106 @@ def image_files(folder: Path, *, below: bool = False) -> list[Path]:
         and path.is_file()
         and is_inside(path.relative_to(folder).as_posix())
     ]
+
+
+def folder_of_images(root: Path) -> Path | None:
+    """Return the first folder that holds any image of ``images/``, ``root`` itself, and the reductions.
+
+    The largest reduction comes first. None if no folder has images.
+    """
+    folders = [root / "images", root, *image_folders(root)]
+    return next((folder for folder in folders if folder.is_dir() and image_files(folder)), None)
+
+
+def folders_to_search(root: Path) -> list[Path]:
+    """Return the folders that may hold the images of a listing.
+
+    They are ``images/``, its reductions, other folders, and ``root``. Masks and folders without images are
+    left out.
+    """
+    named = image_folders(root)
+    others = sorted(path for path in root.iterdir() if path.is_dir() and is_inside(path.name))
+    folders = [*named, *(path for path in others if path not in named and path.name != "masks"), root]
+    return [folder for folder in folders if image_files(folder, below=folder != root)]
+
+
+def find_images(root: Path, names: Sequence[str]) -> tuple[Path, dict[str, Path], bool]:
+    """Return the folder of ``root`` with most images of these ``names``, the paths found, and how.
+
+    Images with exactly these names come first. If no folder has any, those with the same stems are taken,
+    with any suffix and case. The last value is True then.
+    """
+    best: tuple[Path, dict[str, Path], bool] = (root / "images", {}, False)
+    for by_stem in (False, True):
+        for folder in folders_to_search(root):
+            files = image_files(folder, below=True)
+            stored = {_spelling(path.relative_to(folder).as_posix(), by_stem): path for path in files}
+            paths = {name: stored.get(_spelling(name_below_images(name), by_stem)) for name in names}
+            found = {name: path for name, path in paths.items() if path is not None}
+            if len(found) > len(best[1]):
+                best = folder, found, by_stem
+        if best[1]:
+            break
+    return best
+
+
+def _spelling(name: str, by_stem: bool) -> str:
+    return PurePosixPath(name).with_suffix("").as_posix().lower() if by_stem else name
+
+
+def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str, ...]:
+    """Return a note on ``missing`` images, or nothing if all exist.
+
+    Args:
+        missing: names of the missing images.
+        total: number of images in the listing.
+        listing: name of the listing, for the note.
+
+    Raises:
+        InputError: more than half of the images are missing.
+    """
+    if not missing:
+        return ()
+    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+    if 2 * len(missing) > total:
+        raise InputError(
+            f"{listing} lists {len(missing)} images that do not exist: {', '.join(missing[:3])}{more}",
+            hint="put the images where it says, remove the entries, or set ingest.poses=sfm",
+        )
+    return (
+        f"{len(missing)} of {total} images that {listing} lists do not exist: "
+        f"{', '.join(missing[:3])}{more}; they are left out",
+    )
+
+
+def videos_in(folder: Path) -> list[Path]:
+    """Return the videos in ``folder`` itself, in natural order, without hidden ones."""
+    found = [
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and is_inside(path.name)
+    ]
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def left_out(folder: Path) -> tuple[str, ...]:
+    """Return notes on videos and raw photographs in ``folder``, from which images are read."""
+    videos = [path.name for path in videos_in(folder)]
+    raw = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in RAW_SUFFIXES)
+    notes = []
+    if videos:
+        notes.append(
+            f"{_counted(videos, 'video')} in {folder.name}/ left out, as it holds photographs too; "
+            "to take videos, give one as the input, or a folder with videos alone"
+        )
+    if raw:
+        notes.append(f"{_counted(raw, 'file')} not read: convert raw photographs and GIFs to JPEG or PNG")
+    return tuple(notes)
+
+
+def _counted(names: Sequence[str], word: str) -> str:
+    listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return f"{len(names)} {word}{'' if len(names) == 1 else 's'} ({listed})"
 
 
 def is_inside(name: str) -> bool:
@@ -51,7 +154,7 @@ def is_inside(name: str) -> bool:
 
 
 def name_below_images(name: str) -> str:
-    """The name of a listed image by its place below ``images/``."""
+    """Return the name of a listed image relative to ``images/``."""
     return PurePosixPath(name).as_posix().removeprefix("images/")
 
 
@@ -64,14 +167,16 @@ def mask_folder(source: Path) -> Path | None:
 
 
 def mask_externals(source: Path) -> dict[str, External]:
-    """The folder of masks, where there is one, as part of a layout's ``externals``."""
+    """Return the folder of masks, if there is one, as part of a layout's ``externals``."""
     masks = mask_folder(source)
     return {} if masks is None else {"masks": masks}
 
 
 def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
-    """The masks in ``folder`` of the images of these ``names``: in the same place, by stem or full name (as
-    COLMAP has them); elsewhere where no other image has that stem.
+    """Return the masks in ``folder``, by the names of their images.
+
+    A mask has the same relative path as its image, with the stem or the full name (COLMAP's form). If only
+    one image has its stem, the mask may be in another subfolder.
     """
     if folder is None:
         return {}
@@ -93,8 +198,13 @@ def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
 def chosen(
     frames: Sequence[SourceFrame], source: Path, at_most: int, names: Sequence[str] | None = None
 ) -> tuple[SourceFrame, ...]:
-    """At most so many of ``frames``, each with its mask in the input ``source``: the mask of its name, or of
-    the one in ``names``, where it brings none.
+    """Return at most ``at_most`` of ``frames``, evenly, with their masks.
+
+    Args:
+        frames: all frames. A mask that a frame has stays.
+        source: the input, which may contain a folder of masks.
+        at_most: largest number of frames.
+        names: names by which masks are found; None: those of the frames.
     """
     names = [frame.name for frame in frames] if names is None else names
     masks = masks_of(mask_folder(source), names)
@@ -105,7 +215,7 @@ def chosen(
 
 
 def spread(items: Sequence[T], at_most: int) -> list[T]:
-    """At most so many of ``items``, evenly by position, first and last included."""
+    """Return at most ``at_most`` of ``items``, evenly by position, with the first and the last."""
     if len(items) <= at_most:
         return list(items)
     step = (len(items) - 1) / max(1, at_most - 1)
@@ -113,15 +223,15 @@ def spread(items: Sequence[T], at_most: int) -> list[T]:
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:
-    """Sort key by which ``2.jpg`` comes before ``10.jpg``."""
+    """Return a sort key by which ``2.jpg`` comes before ``10.jpg``."""
     parts = re.split(r"(\d+)", text)
     return [(1, int(part), "") if part.isdigit() else (0, 0, part.lower()) for part in parts]
 
 
 def frame_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sort key of frames: `natural_key`, but ``train_`` and ``eval_`` before the file's name do not count.
+    """Return `natural_key` without a prefix ``train_`` or ``eval_`` of the file name.
 
-    3dgs-deblur marks its split so (train_frame_00001.png, eval_frame_00002.png); sorted with these prefixes,
-    the test frames would all come before the others, out of the order in which they were taken.
+    3dgs-deblur marks its split by these prefixes (train_frame_00001.png, eval_frame_00002.png). Sorted with
+    them, all test frames would come first, out of the order in which they were taken.
     """
     return natural_key(re.sub(r"(?<![^/])(train|eval)_(?=[^/]*$)", "", name)), name

@@ -1,11 +1,11 @@
 """Pairs of frames to match, and their matching by processes of one thread each.
 
-Pairs are all with all, or neighbours and distant frames that look alike. That needs no vocabulary from
-elsewhere: the words are clustered from the capture's own descriptors.
+Pairs are all pairs, or neighbours and distant frames that look alike. No external vocabulary is needed: the
+words are clustered from the capture's own descriptors.
 
-COLMAP's own threads do not always find the same matches: with two of them 2 of 76 runs over the same features
-differed (pycolmap 4.2.1), with one none of 60. Each process matches blocks of pairs in its own copy of the
-database. Its matches are gathered in the end, or by the next run when this one is killed.
+COLMAP's threads do not always find the same matches: with two threads 2 of 76 runs over the same features
+differed (pycolmap 4.2.1), with one thread none of 60. Each process matches blocks of pairs in its own copy of
+the database. Its matches are copied back at the end, or by the next run if this one is killed.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from cleargs.capture.colmap import pycolmap
 
 _PAIRS_PER_BLOCK = 200
-"""COLMAP indexes the features of a frame anew in each block (a tenth of the time), and keeps nothing of one
-that it did not finish."""
+"""COLMAP indexes the features of a frame again in each block (a tenth of the time),
+and keeps no matches of an unfinished block."""
 
 N_WORDS = 32
 """Words of the vocabulary: VLAD works with few."""
@@ -39,8 +39,9 @@ _MAX_IMAGES = 2**31 - 1
 
 
 def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
-    """Each frame with its ``overlap`` next ones, and with those 2^k on for k < overlap (COLMAP's quadratic
-    overlap), which bridges stretches too blurred to match.
+    """Return each frame paired with its ``overlap`` next ones, and with those 2^k later for k < overlap.
+
+    The latter (COLMAP's quadratic overlap) bridge stretches that are too blurred to match.
     """
     steps = set(range(1, overlap + 1)) | {2**power for power in range(overlap)}
     return sorted((i, i + step) for i in range(count) for step in steps if i + step < count)
@@ -52,10 +53,17 @@ def loop_pairs(
     min_gap: int,
     seed: int,
 ) -> list[tuple[int, int]]:
-    """Each frame with the ``candidates`` frames at least ``min_gap`` away whose content is most alike.
+    """Return each frame paired with the most similar frames that are at least ``min_gap`` away.
 
-    VLAD (Jégou et al. 2010): residuals to the nearest word, summed per word, signed square root, normalised.
-    Word coordinates are kept whole, so that all large sums are of integers: exact in any order.
+    Similarity is that of VLAD signatures (Jégou et al. 2010): residuals to the nearest word, summed per word,
+    signed square root, normalised. Word coordinates are integers, so that all large sums are exact in any
+    order.
+
+    Args:
+        descriptors: SIFT descriptors of each frame.
+        candidates: pairs per frame.
+        min_gap: smallest difference of frame numbers.
+        seed: seed of the clustering.
     """
     count = len(descriptors)
     if candidates == 0 or count <= min_gap or not any(len(rows) for rows in descriptors):
@@ -108,13 +116,25 @@ def match_pairs(
     processes: int,
     done: Callable[[int], None],
 ) -> None:
-    """Match and verify the pairs of frames (numbers in ``names``) that ``database`` has no matches of yet.
+    """Match and verify the pairs of frames that have no matches in ``database`` yet.
 
-    Equal for any number of processes. ``done`` is told how many pairs are through. Raises BrokenProcessPool
-    when a process ends, sqlite3.DatabaseError when its matches cannot be gathered.
+    The result is the same for any number of processes.
+
+    Args:
+        database: COLMAP's database, which receives the matches.
+        names: names of the images by frame number.
+        pairs: pairs of frame numbers.
+        seed: seed of the verification.
+        processes: number of processes.
+        done: receives the number of finished pairs.
+
+    Raises:
+        BrokenProcessPool: a process ended.
+        sqlite3.DatabaseError: the matches of a process cannot be copied back.
     """
     for leftover in _shares(database):
-        with suppress(sqlite3.DatabaseError):  # damaged by whatever killed it: matched again
+        # One that was damaged when its run was killed is left out: its pairs are matched again.
+        with suppress(sqlite3.DatabaseError):
             _gather(database, leftover)
         remove_database(leftover)
     with pycolmap.Database.open(database) as opened:
@@ -134,7 +154,7 @@ def match_pairs(
 
 
 def _match_block(database: Path, seed: int, block: Sequence[str]) -> int:
-    """Match these pairs (lines of two names) in this process's copy of ``database``; their number."""
+    """Match pairs (lines of two names) in this process's copy of ``database``; return their number."""
     share = database.with_name(f"{database.stem}-share{os.getpid()}.db")
     if not share.exists():
         with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(share)) as target:
@@ -156,8 +176,10 @@ def _shares(database: Path) -> list[Path]:
 
 
 def _gather(database: Path, share: Path) -> None:
-    """Copy the matches in ``share`` to ``database``. Raises sqlite3.DatabaseError, and copies none, where one
-    cannot be read or the other not be written.
+    """Copy the matches in ``share`` to ``database``.
+
+    Raises:
+        sqlite3.DatabaseError: one of them is damaged; no match is copied.
     """
     if not is_sound(share):
         raise sqlite3.DatabaseError(f"{share} is damaged")
@@ -169,7 +191,7 @@ def _gather(database: Path, share: Path) -> None:
 
 
 def is_sound(database: Path) -> bool:
-    """Whether SQLite finds every page of ``database`` in order; COLMAP would abort at one that is not."""
+    """Return True if every page of ``database`` is intact. COLMAP would abort at a damaged page."""
     try:
         with closing(sqlite3.connect(database)) as opened:
             return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
@@ -178,13 +200,13 @@ def is_sound(database: Path) -> bool:
 
 
 def remove_database(database: Path) -> None:
-    """Remove what SQLite wrote of ``database``, its log of changes too."""
+    """Remove the files of ``database``, including SQLite's log of changes."""
     for leftover in database.parent.glob(f"{database.name}*"):
         leftover.unlink()
 
 
 def copy_without_features(database: Path, copy: Path, image_ids: Collection[int]) -> None:
-    """Copy COLMAP's ``database`` but for the features of these images and their matches."""
+    """Copy COLMAP's ``database`` without the features and matches of these images."""
     remove_database(copy)
     listed = ", ".join(str(int(image_id)) for image_id in image_ids)
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
@@ -200,7 +222,7 @@ def copy_without_features(database: Path, copy: Path, image_ids: Collection[int]
 
 
 def why_missing(database: Path, missing: Collection[int]) -> dict[int, str]:
-    """Why COLMAP gave none of the images of these ids a pose."""
+    """Return the reason why COLMAP found no pose, by image id."""
     with pycolmap.Database.open(database) as opened:
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
         features = {image_id: opened.num_keypoints_for_image(image_id) for image_id in missing}

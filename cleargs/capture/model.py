@@ -144,7 +144,7 @@ def _camera_end(data: bytes, at: int) -> int:
 
 
 def _image_end(data: bytes, at: int) -> int:
-    end = data.find(b"\0", at + 64)  # of the name
+    end = data.find(b"\0", at + 64)  # end of the name
     if end < 0:
         raise struct.error
     return end + 9 + _POINT2D.itemsize * _count(data, end + 1)
@@ -195,7 +195,7 @@ def _converted(model: pycolmap.Reconstruction) -> SparseModel:
 
 
 def _image(image: pycolmap.Image, known: NDArray[np.int64]) -> ModelImage:
-    """The image with its keypoints that observe a known point; a point observed twice counts once."""
+    """Return the image with its keypoints that observe a known point; repeated observations count once."""
     keypoints = image.get_observation_points2D()
     xy = np.array([keypoint.xy for keypoint in keypoints], np.float64).reshape(-1, 2)
     ids = np.array([keypoint.point3D_id for keypoint in keypoints], np.int64)

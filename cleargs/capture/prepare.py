@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,12 +11,24 @@ import numpy as np
 
 from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
+from cleargs.capture.overlay import still_parts, wraps_around
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
-from cleargs.media.image import image_size, read_alpha, read_mask, read_rgb, write_mask, write_rgb
+from cleargs.media.image import (
+    image_size,
+    is_panorama,
+    read_alpha,
+    read_mask,
+    read_rgb,
+    write_mask,
+    write_rgb,
+)
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
 from cleargs.types import ImageU8, MaskU8
+
+_PANORAMAS = 3
+"""Pictures that are looked at for panoramas."""
 
 _COARSEST_MASK = 8
 """Most pixels of a working image that one of its mask may stand for, along a side."""
@@ -33,14 +45,24 @@ class WorkFrame:
     height: int
     masked: bool
     camera: Intrinsics | None
+    transparent: bool = False
+    """True where its mask is the transparency of its image."""
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
-    """Write ``folder/images/%06d.png`` and, where something is masked or transparent,
-    ``folder/masks/%06d.png.png`` (as COLMAP names them).
+    """Write the working images ``folder/images/%06d.png`` and their masks ``folder/masks/%06d.png.png``.
 
-    Reduced by area averaging in sRGB, never enlarged. Frames that a killed run left whole are not made again.
-    Raises InputError for unreadable images and for images that do not have their camera's proportions.
+    The names of masks are COLMAP's. Images are reduced by area averaging in sRGB, never enlarged. Intact
+    images of a killed run stay.
+
+    Args:
+        capture: the chosen frames.
+        folder: the folder of the working images.
+        long_side: largest long side, px.
+        reporter: shows progress and remarks.
+
+    Raises:
+        InputError: an unreadable image, an image without the proportions of its camera, or a panorama.
     """
     images, masks = folder / "images", folder / "masks"
     make_folder(images)
@@ -54,14 +76,21 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             else:
                 todo[name] = frame
         if capture.kind == "video":
-            pictures = _decoded(capture.frames[0].path, todo)
+            pictures = _decoded(todo)
         else:
             pictures = ((name, read_image(frame)) for name, frame in todo.items())
         for name, rgb in pictures:
             write_rgb(images / name, reduced(rgb, long_side))
             task.advance()
+    _refuse_panoramas(capture, [images / name for name in names])
+    still = still_parts([images / name for name in names])
+    if still is not None:
+        reporter.warn(
+            f"{(still == 0).mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
+            "masked in all frames"
+        )
     prepared = [
-        _work_frame(frame, images / name, masks / f"{name}.png", reporter)
+        _work_frame(frame, images / name, masks / f"{name}.png", still, reporter)
         for frame, name in zip(capture.frames, names, strict=True)
     ]
     if any(made.masked for made in prepared):
@@ -69,7 +98,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             mask = masks / f"{made.image}.png"
             if not mask.is_file():
                 write_mask(mask, np.full((made.height, made.width), 255, np.uint8))
-    transparent = sum(made.masked and made.source.mask is None for made in prepared)
+    transparent = sum(made.transparent for made in prepared)
     if transparent:
         reporter.info(
             f"{transparent} of {len(prepared)} images are transparent in places: ignored, like masks"
@@ -77,21 +106,33 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     return prepared
 
 
+def _refuse_panoramas(capture: Capture, images: Sequence[Path]) -> None:
+    """Raise InputError if the first images are equirectangular by their metadata or their edges."""
+    first = list(zip(capture.frames, images, strict=True))[:_PANORAMAS]
+    if all(
+        (frame.pts is None and is_panorama(frame.path)) or wraps_around(read_rgb(at)) for frame, at in first
+    ):
+        raise InputError(
+            "the pictures are equirectangular panoramas, which show all directions",
+            hint="cut perspective views out of them first (ffmpeg's filter v360 does), and give these",
+        )
+
+
 def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = read_rgb) -> bool:
-    """Whether a killed run left ``image`` whole. What else lies there is thrown away, with a warning."""
+    """Return True if a killed run left ``image`` intact. A damaged file is removed with a warning."""
     if not image.is_symlink() and not image.exists():
         return False
     try:
         read(image)
         return True
     except InputError:
-        reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is made again")
+        reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is written again")
         remove(image)
         return False
 
 
 def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
-    """The image with a long side of at most ``long_side`` px, by area averaging."""
+    """Return the image with a long side of at most ``long_side`` px, by area averaging."""
     width, height = reduced_size(image.shape[1], image.shape[0], long_side)
     if (height, width) == image.shape[:2]:
         return image
@@ -100,38 +141,42 @@ def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
 
 
 def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
-    """Width and height scaled alike to a long side of at most ``long_side`` px."""
+    """Return width and height, scaled to a long side of at most ``long_side`` px."""
     scale = min(1.0, long_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _decoded(video: Path, frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, ImageU8]]:
-    """The names and pictures of these frames of a video, in its order."""
-    names = {frame.pts: name for name, frame in frames.items() if frame.pts is not None}
-    if names:
-        yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, names))
+def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, ImageU8]]:
+    """Yield the names and images of these frames of videos, one video after the other."""
+    for video in dict.fromkeys(frame.path for frame in frames.values()):
+        names = {frame.pts: name for name, frame in frames.items() if frame.path == video}
+        wanted = [pts for pts in names if pts is not None]
+        yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, wanted))
 
 
 def read_image(frame: SourceFrame) -> ImageU8:  # [H, W, 3]
-    """The image turned as EXIF says, unless the frame's camera belongs to the image as it is stored."""
+    """Return the image, turned by its EXIF orientation unless the frame's camera fits the stored image."""
     return read_rgb(frame.path, upright=not _is_as_stored(frame))
 
 
 def _is_as_stored(frame: SourceFrame) -> bool:
-    """Whether the frame's camera fits the image as it is stored, which is what COLMAP works on. Half a turn
-    keeps the proportions: then it is taken to fit.
+    """Return True if the frame's camera fits the stored image, on which COLMAP works.
+
+    A half turn keeps the proportions. Then the camera counts as fitting.
     """
     camera = frame.camera
     return camera is not None and _alike(camera.width, camera.height, image_size(frame.path))
 
 
 def _alike(width: int, height: int, size: tuple[int, int]) -> bool:
-    """Whether an image of this width and height has these proportions, but for rounding to whole pixels."""
+    """Return True if width and height have the proportions of ``size``, up to rounding to whole pixels."""
     w, h = size
     return bool(abs(w * height - h * width) <= max(width, height) + max(w, h))
 
 
-def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter) -> WorkFrame:
+def _work_frame(
+    frame: SourceFrame, image: Path, mask: Path, still: MaskU8 | None, reporter: Reporter
+) -> WorkFrame:
     rgb = read_rgb(image)
     height, width = rgb.shape[:2]
     camera = frame.camera
@@ -143,21 +188,39 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
             )
         camera = camera.resized(width, height)
     stencil = read_stencil(frame)
-    if stencil is not None and not resumable(mask, reporter, read_mask):
-        # To whole pixels, a mask of one pixel has any proportions.
-        coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
-        if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
-            what = "is far smaller than it" if coarse else "does not have its proportions"
-            raise InputError(
-                f"the mask of {frame.name} {what}",
-                hint="make masks of the size of their images",
-            )
-        write_mask(mask, np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST)))
-    return WorkFrame(frame, image.name, width, height, stencil is not None, camera)
+    still = still if still is not None and still.shape == (height, width) else None
+    masked = stencil is not None or still is not None
+    if masked and not resumable(mask, reporter, read_mask):
+        write_mask(mask, _stencilled(frame, stencil, still, width, height))
+    transparent = stencil is not None and frame.mask is None
+    return WorkFrame(frame, image.name, width, height, masked, camera, transparent)
+
+
+def _stencilled(
+    frame: SourceFrame,
+    stencil: MaskU8 | None,
+    still: MaskU8 | None,
+    width: int,
+    height: int,
+) -> MaskU8:  # [height, width]
+    """Return the mask of a working image: 0 where its own mask or that of still parts is 0."""
+    mask = np.full((height, width), 255, np.uint8) if still is None else still
+    if stencil is None:
+        return mask
+    # To whole pixels, a mask of one pixel has any proportions.
+    coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
+    if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
+        what = "is far smaller than it" if coarse else "does not have its proportions"
+        raise InputError(
+            f"the mask of {frame.name} {what}",
+            hint="make masks of the size of their images",
+        )
+    own = np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST))
+    return np.minimum(mask, own)
 
 
 def read_stencil(frame: SourceFrame) -> MaskU8 | None:
-    """Where the frame counts: its mask, else the transparency of its image; None where all of it does."""
+    """Return the mask of the frame, else the transparency of its image; None if all of it counts."""
     if frame.mask is not None:
         return read_mask(frame.mask)
     return None if frame.pts is not None else read_alpha(frame.path, upright=not _is_as_stored(frame))

@@ -36,12 +36,24 @@ def publish(
 ) -> SparseModel:
     """Write images, masks, the three tables and the COLMAP model of the undistorted capture into ``out``.
 
-    ``placed`` says of every working image how its pose was found, or why there is none.
-    Points take their colour from train frames; a point that no train frame shows (or fewer than two frames in
-    all, after undistortion cropped them) is left out. Returns the published model.
+    Points take their colour from train frames. Points that no train frame shows, or fewer than two frames
+    after undistortion cropped them, are left out.
+
+    Args:
+        frames: the working images.
+        model: sparse model of the working images, in the normalised world.
+        placed: how the pose of each working image was found, or why there is none.
+        test: numbers of the test frames.
+        work: folder of the working images.
+        out: folder of the stage.
+        max_size: largest long side of the published images, px.
+        reporter: shows progress and remarks.
+
+    Returns:
+        The published model.
     """
     make_folder(out / "images")
-    remove(out / "masks")  # written anew, and without any the folder says that no frame has one
+    remove(out / "masks")  # without the folder, no frame has a mask
     if any(frame.masked for frame in frames):
         make_folder(out / "masks")
     ours = {frame.image for frame in frames}
@@ -100,7 +112,7 @@ def publish(
 
 
 def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Intrinsics]:
-    """The camera of each frame; an unregistered one takes its own, else the commonest of its size."""
+    """Return the camera of each frame; for an unregistered one its own, else the commonest of its size."""
     by_name = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     found = [by_name.get(frame.image, frame.camera) for frame in frames]
     common = Counter(camera for camera in found if camera is not None).most_common()
@@ -130,7 +142,7 @@ def _write_picture(
 
 
 def _flattened(image: ModelImage, undistortion: Undistorter) -> ModelImage:
-    """The observations in the published image; those in the cropped margin are gone."""
+    """Return the observations in the published image, without those in the cropped margin."""
     xy = undistortion.points(image.xy)
     return replace(image, xy=xy).select(undistortion.inside(xy))
 

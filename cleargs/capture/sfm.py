@@ -1,26 +1,30 @@
-"""Poses and sparse points: SfM where the capture has no poses; where it has, triangulation, and adjustment of
-poses that the images contradict (those of depth cameras and headsets mostly; SfM's hardly ever).
+"""Poses, cameras and sparse points of a capture.
 
-COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
+A capture without poses gets them by structure from motion. Given poses are triangulated. Poses and cameras
+that the images contradict are adjusted or found again: mostly those of depth cameras and headsets. COLMAP
+itself runs in `cleargs.capture.sfm_worker`, a child process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from cleargs.capture.adjustment import FIRST_LENS
 from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.matching import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_worker import OUTCOME, Job, SfmOutcome
+from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
+from cleargs.media.image import lens_name
 from cleargs.progress import Reporter
 from cleargs.safe_io import FAULTS, cause, read_json
 
@@ -54,11 +58,21 @@ def reconstruct(
     threads: int,
     reporter: Reporter,
 ) -> Reconstruction:
-    """Poses, cameras and points of the working images in ``folder``.
+    """Return poses, cameras and points of the working images in ``folder``.
 
-    Poses of the input are normalised in float64 before COLMAP sees them; ``given`` (the input's own sparse
-    model) saves the triangulation where its poses are good, and keeps its points unless they are adjusted.
-    Raises StageError when too few frames get a pose.
+    Poses of the input are normalised in float64 before COLMAP uses them.
+
+    Args:
+        frames: the working images.
+        given: the input's sparse model. If its poses fit the images, it replaces the triangulation.
+        folder: folder of the working images and of COLMAP's files.
+        config: settings.
+        seed: seed of all random choices.
+        threads: CPU threads; the result does not depend on it.
+        reporter: shows progress and remarks.
+
+    Raises:
+        StageError: too few frames get a pose.
     """
     posed = [frame for frame in frames if frame.source.pose is not None]
     if not posed:
@@ -79,29 +93,69 @@ def reconstruct(
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
             placed = _placed_by_input(frames, refined=False)
             return Reconstruction(adopted, similarity, SfmOutcome(placed=placed, missed_px=missed))
-    moved = [similarity.pose(pose) for pose in poses]
-    model, outcome = _run(job_of(posed, moved, folder, config, seed, threads), reporter)
+    worlds = _conventions(poses, similarity) if given is None else {OWN: (similarity, poses)}
+    readings = {name: [world.pose(pose) for pose in read] for name, (world, read) in worlds.items()}
+    model, outcome = _run(job_of(posed, readings, folder, config, seed, threads), reporter)
     if not len(model.point_ids):
         raise StageError(
             "no point could be triangulated at the given poses",
             hint="check that poses, axes (OpenGL camera to world) and images belong together, "
             "or set ingest.poses=sfm",
         )
-    missed, refined = outcome.missed_px or 0.0, outcome.refined
-    if refined:
+    similarity = worlds[outcome.convention][0]
+    if outcome.convention != OWN:
+        reporter.warn(
+            f"the poses do not fit the images as they should be meant: read as {outcome.convention}"
+        )
+    _report_outcome(outcome, float(np.median(model.error)), config, reporter)
+    if outcome.method == "sfm":
+        again = normalise([image.pose for _, image in sorted(model.images.items())])
+        model, similarity = _transformed(model, again), similarity.then(again)
+        placed = _placed_by_input(frames, refined=True) | dict(outcome.placed)
+        return Reconstruction(model, similarity, outcome.model_copy(update={"placed": placed}))
+    if adopted is not None and len(adopted.error) and not outcome.refined:
+        model = adopted
+    placed = _placed_by_input(frames, outcome.refined)
+    return Reconstruction(model, similarity, outcome.model_copy(update={"placed": placed}))
+
+
+def _conventions(poses: Sequence[Pose], own: Similarity) -> dict[str, tuple[Similarity, Sequence[Pose]]]:
+    """Return the poses of a transforms.json by each convention that its author may have meant.
+
+    The value is the similarity that normalises their world, and the poses in the input's.
+    """
+    meant = {
+        "matrices with OpenCV axes (y down, z forward)": [pose.with_flipped_axes() for pose in poses],
+        "matrices from the world to the camera": [pose.inverted(flip=True) for pose in poses],
+        "matrices from the world to the camera, with OpenCV axes": [
+            pose.inverted(flip=False) for pose in poses
+        ],
+    }
+    found: dict[str, tuple[Similarity, Sequence[Pose]]] = {OWN: (own, poses)}
+    for name, others in meant.items():
+        with suppress(InputError):  # all at one place by this one
+            found[name] = normalise(others), others
+    return found
+
+
+def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, reporter: Reporter) -> None:
+    """Say whether the input's poses were adjusted or found again, and by how much that explains more."""
+    missed = outcome.missed_px or 0.0
+    if outcome.refined:
+        before, after = outcome.errors_px["given"], outcome.errors_px[outcome.method]
+        what = "poses and cameras are adjusted to the images"
+        if outcome.method == "sfm":
+            what = "poses and cameras are found again and laid over the given ones"
         reporter.info(
-            f"at the input's poses features missed their points by {missed:.1f} px (median): adjusted to the "
-            f"images, {np.median(model.error):.1f} px; ingest.refine_above keeps them"
+            f"at the input's poses features missed their points by {missed:.1f} px (median): {what} "
+            f"({outcome.lens}), {found:.1f} px. Matches that took no part are off by {after:.2f} px, not "
+            f"{before:.2f}; a larger ingest.refine_above keeps the input's poses"
         )
     elif missed > config.refine_above:
         reporter.info(
             f"at the input's poses features miss their points by {missed:.1f} px (median), which no other "
-            "poses explain (a rolling shutter, blur, or a wrong lens may): they stay"
+            "poses and cameras explain (a rolling shutter or blur may): they stay"
         )
-    if adopted is not None and len(adopted.error) and not refined:
-        model = adopted
-    placed = _placed_by_input(frames, refined)
-    return Reconstruction(model, similarity, SfmOutcome(placed=placed, missed_px=missed, refined=refined))
 
 
 def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
@@ -123,22 +177,30 @@ def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
 
 def job_of(
     frames: Sequence[WorkFrame],
-    poses: Sequence[Pose] | None,
+    poses: Mapping[str, Sequence[Pose]] | None,
     folder: Path,
     config: SfmConfig,
     seed: int,
     threads: int,
 ) -> Job:
-    """What COLMAP is to do with the working images in ``folder``.
+    """Return the job of COLMAP's process for the working images in ``folder``.
 
-    Without poses, frames of one size share a camera, or each frame has its own; an input image of each camera
-    may state its focal length.
+    Without poses, frames of one size and one lens share a camera, or each frame has its own. An input image
+    of each camera may state its focal length.
+
+    Args:
+        frames: the working images.
+        poses: convention -> poses of all frames; None: they must be found.
+        folder: folder of the working images.
+        config: settings.
+        seed: seed of all random choices.
+        threads: CPU threads.
     """
     folder = folder.resolve()
     if poses is not None:
         owners: list[object] = [frame.camera for frame in frames]
     elif config.shared_camera:
-        owners = [(frame.width, frame.height) for frame in frames]
+        owners = [(frame.width, frame.height, _lens_of(frame)) for frame in frames]
     else:
         owners = [frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
@@ -146,10 +208,14 @@ def job_of(
     exif_images: list[Path | None] = []
     for frame in (frames[owners.index(owner)] for owner in numbers):
         known = frame.camera if poses is not None else None
-        cameras.append(known or guessed_camera(config.camera_model, frame.width, frame.height))
+        model = FIRST_LENS if config.camera_model == "auto" else config.camera_model
+        cameras.append(known or guessed_camera(model, frame.width, frame.height))
         stated = poses is None and frame.source.pts is None
         exif_images.append(frame.source.path.resolve() if stated else None)
-    matrices = [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in poses or ()]
+    matrices = {
+        name: [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in read]
+        for name, read in (poses or {}).items()
+    }
     return Job(
         folder=folder,
         images=folder / "images",
@@ -165,17 +231,22 @@ def job_of(
     )
 
 
-def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:
-    """The model that a killed run left in ``folder``, or None.
+def _lens_of(frame: WorkFrame) -> object:
+    """Return what frames of one lens share: the video, or camera and focal length by EXIF."""
+    return frame.source.path if frame.source.pts is not None else lens_name(frame.source.path)
 
-    What is damaged, COLMAP's database too, is thrown away with a warning.
+
+def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:
+    """Return the model that a killed run left in ``folder``, or None.
+
+    A damaged model or database is removed with a warning.
     """
     model, database = folder / "model", folder / "database.db"
     if model.exists():
         try:
             return _read(model)
         except InputError as error:
-            reporter.warn(f"the damaged model of an interrupted run is made again: {error}")
+            reporter.warn(f"the damaged model of an interrupted run is computed again: {error}")
             remove(model)
     if database.exists() and not is_sound(database):
         reporter.warn("the damaged features of an interrupted run are found again")
@@ -184,7 +255,7 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]
 
 
 def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
-    """The model and the outcome that COLMAP's process wrote. Raises InputError where one is damaged."""
+    """Return the model and the outcome of COLMAP's process. Raises InputError if one is damaged."""
     try:
         return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
     except FAULTS as error:
@@ -202,13 +273,13 @@ def _transformed(model: SparseModel, similarity: Similarity) -> SparseModel:
 
 
 def _within_reach(model: SparseModel) -> SparseModel:
-    """The model without the points beyond `FARTHEST`, which single precision may not hold."""
+    """Return the model without the points beyond `FARTHEST`, which single precision may not hold."""
     near = np.asarray((np.abs(model.xyz) < FARTHEST).all(axis=1))  # infinite ones, and NaN, are not
     return replace(model.select(near), dropped=model.dropped + int((~near).sum()))
 
 
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:
-    """The input's own model, restricted to ``frames``: working image names, cameras and pixels."""
+    """Return the input's model of ``frames``, with names, cameras and pixels of the working images."""
     by_name = {image.name: image for image in given.images.values()}
     cameras: dict[int, Intrinsics] = {}
     images: dict[int, ModelImage] = {}

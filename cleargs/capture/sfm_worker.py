@@ -1,12 +1,12 @@
 """The COLMAP side of ingest: ``python -m cleargs.capture.sfm_worker job.json``, run by `cleargs.capture.sfm`.
 
-Reads its job from JSON, works in ``job["folder"]`` and leaves a binary model in ``folder/model``. What a
-killed run left in the database (features, matches) is used again. Frames that mapping leaves out are tried a
-second time at half resolution.
+It reads its job from JSON, works in ``job["folder"]`` and writes a binary model to ``folder/model``. Features
+and matches of a killed run are used again. Frames that mapping leaves out are tried a second time at half
+resolution.
 
-Equal for any number of threads: ids are given in frame order before any thread starts, every random choice is
-seeded, frames are matched by processes, and mapping and triangulation (whose least squares sum in thread
-order) run on one thread.
+The result is the same for any number of threads: ids are given in frame order before any thread starts, every
+random choice is seeded, frames are matched by processes, and mapping and triangulation (whose least squares
+sum in thread order) run on one thread.
 """
 
 from __future__ import annotations
@@ -20,14 +20,19 @@ from itertools import combinations, count
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field
 
-from cleargs.base_model import FrozenModel
-from cleargs.capture.cameras import Intrinsics
+from cleargs.capture.adjustment import (
+    FIRST_LENS,
+    SHARED_BY,
+    Adjuster,
+    lay_over,
+    lens_of,
+    median_residual,
+)
+from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.config import SfmConfig
+from cleargs.capture.judging import epipolar_errors, verified_matches
 from cleargs.capture.matching import (
     copy_without_features,
     loop_pairs,
@@ -36,77 +41,53 @@ from cleargs.capture.matching import (
     sequential_pairs,
     why_missing,
 )
+from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
 
 _MIN_MODEL = 10
-"""COLMAP's fewest frames of a model: a smaller one is thrown away and begun elsewhere. In a short capture, a
-third of its frames: eight of a dozen are a model."""
-_REFINEMENTS = 4
-_CONVINCING = 0.5
-"""Adjusted poses are taken where features then miss their points by at most this share of before. What was
-left on measured captures: 0.05 with random errors of poses, 0.34 and 0.41 with the poses of a depth camera
-and of a headset, but 0.77 with a rolling shutter and all with blur, which other poses do not explain."""
-_HELD_BY = 15
-"""Fewest points that a frame must see to take part in an adjustment."""
-
-
-OUTCOME = "outcome.json"
-"""In the folder of the model: its `SfmOutcome`."""
-
-
-class Job(FrozenModel):
-    """What COLMAP gets: working images, their cameras, the poses if they are known, and settings."""
-
-    folder: Path
-    images: Path
-    masks: Path | None
-    names: list[str]
-    cameras: list[Intrinsics]
-    camera_of: list[int]
-    """For each image the number of its camera."""
-    poses: list[list[list[float]]] | None
-    """World to camera, 3x4 for each image."""
-    exif_images: list[Path | None]
-    """For each camera an input image that may state its focal length."""
-    config: SfmConfig
-    seed: int
-    threads: int
-
-
-class SfmOutcome(FrozenModel):
-    """Origin of a model."""
-
-    placed: Mapping[str, str] = Field(default_factory=dict)
-    """Working image -> how its pose was found, or why there is none; COLMAP's process knows it of SfM."""
-    missed_px: float | None = None
-    """Median reprojection error at the input's poses, px of the working images; None: it brought no poses."""
-    refined: bool = False
-    """Whether they were adjusted."""
+"""COLMAP's fewest frames of a model: it discards a smaller one and starts elsewhere. In a
+short capture it is a third of the frames, because eight of twelve are a model."""
+_CONVINCING = 0.6
+"""Adjusted poses and cameras are taken if matches that were kept out are then off by at
+most this share of the error before (medians). Measured: 0.17 with the poses of a depth camera, 0.47 with
+those of a headset."""
+_EXPLAINED = 1.5
+"""Poses are found again if matches that were kept out are off by more than this, in units of the error that
+separate geometries of the pairs leave. Measured: 0.94 and 1.06 with the adjusted poses of a depth camera and
+of a headset, 3 if an adjustment from poses that were off by 4 degrees ended at wrong ones."""
+_FITS_PX, _FITS = 2.0, 0.5
+"""Poses fit the images where at least this share of the matches is within this
+many pixels of its epipolar line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes,
+0.13 with inverted matrices."""
 
 
 @dataclass(frozen=True)
 class _FeatureSettings:
-    """How features are found and matched, and when a frame counts as placed by them."""
+    """Settings of features, and of the frames that they place."""
 
-    reduced: int
+    name: str
+    """Value of ``placed`` of these frames."""
+    reduced: int = 1
     """The images are reduced to one over this, if any is as large as the largest."""
-    contrast: float
-    inliers: int
+    contrast: float = 0.02 / 3
+    inliers: int = 30
     """Fewest points of the model that must fit the pose of a frame."""
-    again: str = ""
+    suffix: str = ""
+    """Added to the name of a step that is repeated."""
 
 
-_FIRST = _FeatureSettings(reduced=1, contrast=0.02 / 3, inliers=30)
+_FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
-_SECOND = _FeatureSettings(reduced=2, contrast=0.002, inliers=15, again=" again")
-"""For frames with a blur of 24 px at 480: at half the size it is half as long, and what contrast it left is
-enough (docs/experiments/poses.md)."""
+_SECOND = _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15, suffix=" again")
+"""For frames that are left out. A blur of 24 px at 480 is half as long at half the size, and the contrast
+that it leaves is enough (docs/experiments/poses.md). Affine-shape features and guided matching of these
+frames place no more of them (blurball, office)."""
 
 
 def main() -> int:
-    """Do the job; the exit code is 3 when it failed with a reason that was reported."""
+    """Do the job; the exit code is 3 if it failed for a reason that was reported."""
     report = reports_to_parent()
     job = Job.model_validate(read_json(Path(sys.argv[1])))
     try:
@@ -124,6 +105,8 @@ class _Sfm:
         self._job = job
         self._report = report
         self._database = job.folder / "database.db"
+        self._matched = self._database
+        """The database with the features by which frames were placed."""
         self._output = job.folder / "model.partial"
         self._options = pycolmap.IncrementalPipelineOptions(
             num_threads=1, random_seed=job.seed, extract_colors=False
@@ -154,17 +137,12 @@ class _Sfm:
         self._match(self._database, pairs, _FIRST)
         make_folder(self._output, empty=True)
         if job.poses is None:
-            model = self._map()
-            model, placed = self._place_the_rest(model, pairs)
-            outcome = SfmOutcome(placed=placed)
+            model, placed = self._found(pairs)
+            if job.config.camera_model == "auto":
+                model = self._adjuster(self._matched).with_measured_lens(model)
+            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model))
         else:
-            model = self._triangulate()
-            missed = _median_error(model)
-            outcome = SfmOutcome(missed_px=missed)
-            if missed > job.config.refine_above:
-                adjusted = self._refine(copy.deepcopy(model))
-                if adjusted is not None and _median_error(adjusted) <= _CONVINCING * missed:
-                    model, outcome = adjusted, SfmOutcome(missed_px=missed, refined=True)
+            model, outcome = self._from_poses(job.poses, pairs)
         make_folder(self._output, empty=True)
         model.write_binary(self._output)
         write_json(self._output / OUTCOME, outcome.model_dump())
@@ -172,18 +150,93 @@ class _Sfm:
         self._output.rename(job.folder / "model")
         sync(job.folder)
 
+    def _found(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
+        """Return the model of structure from motion, and how each frame was placed."""
+        return self._place_the_rest(self._map(), pairs)
+
+    def _from_poses(
+        self, given: Mapping[str, list[list[list[float]]]], pairs: Sequence[tuple[int, int]]
+    ) -> tuple[pycolmap.Reconstruction, SfmOutcome]:
+        """Return the model at the input's poses, or at others where the images contradict these."""
+        convention = self._convention(given)
+        start = self._triangulate(given[convention])
+        missed = median_residual(start)
+        outcome = SfmOutcome(missed_px=missed, convention=convention)
+        if missed <= self._job.config.refine_above and len(start.points3D):
+            return start, outcome
+        adjuster = self._adjuster(self._database)
+        errors = {"given": adjuster.median_error(start)}
+        models = {}
+        placed: dict[str, str] = {}
+        self._report(phase="adjusting poses and cameras", total=None)
+        shared = len(self._job.names) >= SHARED_BY * len(self._job.cameras)
+        adjusted = adjuster.refine(start, cameras=shared) if len(start.points3D) else None
+        if adjusted is not None:
+            models["adjusted"] = adjusted
+            errors["adjusted"] = adjuster.median_error(adjusted)
+        explained = adjusted is not None and errors["adjusted"] <= _EXPLAINED * adjuster.floor
+        if not explained and (found := self._sfm_over(start, pairs, adjuster)) is not None:
+            models["sfm"], placed = found
+            errors["sfm"] = adjuster.median_error(models["sfm"])
+        outcome = outcome.model_copy(update={"errors_px": errors})
+        best = min(models, key=lambda method: errors[method], default="")
+        if not best or not 0 < errors[best] <= _CONVINCING * errors["given"]:
+            return start, outcome
+        model = self._with_points(models[best], self._matched if best == "sfm" else self._database)
+        update = {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
+        return model, outcome.model_copy(update=update)
+
+    def _adjuster(self, database: Path) -> Adjuster:
+        return Adjuster(database, self._with_points)
+
+    def _convention(self, given: Mapping[str, list[list[list[float]]]]) -> str:
+        """Return the convention by which poses fit the matches best; `OWN` where it fits, or none does."""
+        if len(given) == 1:
+            return OWN
+        matches = verified_matches(self._database)
+        cameras = [_colmap_camera(self._job, number) for number in range(len(self._job.cameras))]
+        camera_of = {index + 1: cameras[number] for index, number in enumerate(self._job.camera_of)}
+        fits = {}
+        for convention, matrices in given.items():
+            poses = {index + 1: np.array(matrix) for index, matrix in enumerate(matrices)}
+            off = epipolar_errors(matches, poses, camera_of)
+            fits[convention] = float((off < _FITS_PX).mean()) if len(off) else 0.0
+        best = max(fits, key=lambda convention: fits[convention])
+        return best if fits[OWN] < _FITS <= fits[best] else OWN
+
+    def _sfm_over(
+        self, given: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]], judge: Adjuster
+    ) -> tuple[pycolmap.Reconstruction, dict[str, str]] | None:
+        """Return the model of structure from motion in the world of ``given``, and how frames were placed.
+
+        The matches that ``judge`` kept out take no part in its last adjustment. None where a frame has no
+        pose.
+        """
+        job = self._job
+        guesses = [guessed_camera(FIRST_LENS, camera.width, camera.height) for camera in job.cameras]
+        self._set_cameras([pycolmap.Camera(**asdict(guess)) for guess in guesses])
+        try:
+            model, placed = self._found(pairs)
+        except StageError:
+            return None
+        if model.num_reg_images() < len(job.names):
+            return None
+        # Frames that were placed again have other features. The tracks of the others are kept out alike.
+        adjuster = judge if self._matched == self._database else self._adjuster(self._matched)
+        model = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
+        lay_over(model, given, model.images.values())
+        return model, placed
+
     def _import(self) -> None:
         """Create the database with cameras and images in frame order: ids do not depend on threads."""
         job = self._job
+        cameras = [_colmap_camera(job, number) for number in range(len(job.cameras))]
         if self._database.exists():
             with pycolmap.Database.open(self._database) as opened:
-                if opened.num_images() == len(job.names):
-                    return
+                whole = opened.num_images() == len(job.names)
+            if whole:
+                return self._set_cameras(cameras)  # a killed run may have adjusted them
             remove_database(self._database)
-        cameras = [pycolmap.Camera(**asdict(camera)) for camera in job.cameras]
-        for camera, image in zip(cameras, job.exif_images, strict=True):
-            if image is not None:
-                apply_exif_focal(camera, image)
         with pycolmap.Database.open(self._database) as opened, pycolmap.DatabaseTransaction(opened):
             for index, camera in enumerate(cameras):
                 camera.camera_id = index + 1
@@ -198,6 +251,12 @@ class _Sfm:
                 frame.add_data_id(shot.data_id)
                 opened.write_frame(frame, use_frame_id=True)
 
+    def _set_cameras(self, cameras: Sequence[pycolmap.Camera]) -> None:
+        with pycolmap.Database.open(self._database) as opened:
+            for index, camera in enumerate(cameras):
+                camera.camera_id = index + 1
+                opened.update_camera(camera)
+
     def _extract(self, database: Path, names: Sequence[str], settings: _FeatureSettings) -> None:
         """SIFT on the working images; frames that have features already are skipped by COLMAP."""
         job = self._job
@@ -209,7 +268,7 @@ class _Sfm:
         reader = pycolmap.ImageReaderOptions()
         if job.masks is not None:
             reader.mask_path = job.masks
-        self._report(phase=f"finding features{settings.again}", total=len(names))
+        self._report(phase=f"finding features{settings.suffix}", total=len(names))
         size = 4 * job.threads
         for start in range(0, len(names), size):
             block = list(names[start : start + size])
@@ -221,9 +280,14 @@ class _Sfm:
     def _match(self, database: Path, pairs: Sequence[tuple[int, int]], settings: _FeatureSettings) -> None:
         """Match and verify pairs of frames; pairs that were matched before are skipped."""
         job = self._job
-        self._report(phase=f"matching{settings.again}", total=len(pairs))
+        self._report(phase=f"matching{settings.suffix}", total=len(pairs))
         match_pairs(
-            database, job.names, pairs, job.seed, job.threads, lambda through: self._report(done=through)
+            database,
+            job.names,
+            pairs,
+            job.seed,
+            job.threads,
+            lambda through: self._report(done=through),
         )
 
     def _pairs(self) -> list[tuple[int, int]]:
@@ -269,16 +333,19 @@ class _Sfm:
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
     ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Go on mapping with the features of the frames without a pose found anew by `_SECOND`; how each
-        frame was placed, or why it was not.
+        """Continue mapping with features by `_SECOND` of the frames without a pose.
 
-        Works in a copy of the database: a killed run finds the first as it was.
+        It works in a copy of the database, so that a killed run finds the first one unchanged.
+
+        Returns:
+            The model, and for each image how it was placed or why it was not.
         """
         names = self._job.names
+        self._matched = self._database
         first = _names_in(model)
         missing = [index for index, name in enumerate(names) if name not in first]
         if not missing:
-            return model, dict.fromkeys(names, "sfm")
+            return model, dict.fromkeys(names, _FIRST.name)
         second = self._database.with_name("second.db")
         copy_without_features(self._database, second, [index + 1 for index in missing])
         self._extract(second, [names[index] for index in missing], _SECOND)
@@ -288,19 +355,20 @@ class _Sfm:
         options.multiple_models = False
         options.mapper.abs_pose_min_num_inliers = _SECOND.inliers
         start = self._output / "first"
-        make_folder(start)
+        make_folder(start, empty=True)
         model.write_binary(start)
         models = pycolmap.incremental_mapping(
             second, self._job.images, self._output, options, input_path=start
         )
-        model = max([model, *models.values()], key=lambda model: model.num_reg_images())
-        placed = dict.fromkeys(_names_in(model), "sfm at half resolution") | dict.fromkeys(first, "sfm")
+        best = max([model, *models.values()], key=lambda model: model.num_reg_images())
+        if best is not model:
+            model, self._matched = best, second
+        placed = dict.fromkeys(_names_in(model), _SECOND.name) | dict.fromkeys(first, _FIRST.name)
         reasons = why_missing(second, [index + 1 for index, name in enumerate(names) if name not in placed])
         return model, placed | {names[image_id - 1]: reason for image_id, reason in reasons.items()}
 
-    def _triangulate(self) -> pycolmap.Reconstruction:
-        """Points at the given poses and cameras, which stay as they are here."""
-        assert self._job.poses is not None
+    def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
+        """Return points at the given poses and cameras, which stay as they are here."""
         self._report(phase="triangulating", total=None)
         model = pycolmap.Reconstruction()
         with pycolmap.Database.open(self._database) as opened:
@@ -309,52 +377,18 @@ class _Sfm:
             for image in sorted(opened.read_all_images(), key=lambda image: image.image_id):
                 model.add_image_with_trivial_frame(
                     pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
-                    pycolmap.Rigid3d(np.array(self._job.poses[image.image_id - 1])),
+                    pycolmap.Rigid3d(np.array(poses[image.image_id - 1])),
                 )
-        return self._with_points(model)
+        return self._with_points(model, self._database)
 
-    def _with_points(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """``model`` with points triangulated again."""
+    def _with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
+        """Return ``model`` with points triangulated again from the matches in ``database``."""
+        with pycolmap.Database.open(database) as opened:
+            for camera in model.cameras.values():  # COLMAP refuses a model of another lens
+                opened.update_camera(camera)
         return pycolmap.triangulate_points(
-            model, self._database, self._job.images, self._output, options=self._options
+            model, database, self._job.images, self._output, options=self._options
         )
-
-    def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction | None:
-        """Adjust poses and points to the features; the cameras stay.
-
-        At better poses more features find their points, so both are done in turn. The features leave place,
-        turn and size of the whole open: the adjusted cameras are laid over the given ones by a similarity. A
-        frame that few points hold keeps its given pose. None where few points hold every frame.
-        """
-        given = {
-            frame_id: pycolmap.Rigid3d(frame.rig_from_world.matrix())
-            for frame_id, frame in model.frames.items()
-        }
-        before = {image.name: _centre_and_axes(image) for image in model.images.values()}
-        options = pycolmap.BundleAdjustmentOptions(
-            refine_focal_length=False, refine_extra_params=False, print_summary=False
-        )
-        # Wrong matches are still among them.
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.solver_options.num_threads = 1
-        self._report(phase="adjusting poses", total=_REFINEMENTS)
-        for done in range(_REFINEMENTS):
-            pycolmap.bundle_adjustment(model, options)
-            model = self._with_points(model)
-            self._report(done=done + 1)
-        held = [image for image in model.images.values() if image.num_points3D >= _HELD_BY]
-        if not held:
-            return None
-        similarity = pycolmap.estimate_sim3d(
-            np.array([_centre_and_axes(image) for image in held]).reshape(-1, 3),
-            np.array([before[image.name] for image in held]).reshape(-1, 3),
-        )
-        if similarity is not None:
-            model.transform(similarity)
-        for image in model.images.values():
-            if image.num_points3D < _HELD_BY:
-                model.frames[image.frame_id].rig_from_world = given[image.frame_id]
-        return model
 
 
 def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
@@ -373,18 +407,12 @@ def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
     camera.has_prior_focal_length = True
 
 
-def _median_error(model: pycolmap.Reconstruction) -> float:
-    """Median over the points of their mean reprojection error, px; 0 without any point."""
-    errors = [point.error for point in model.points3D.values()]
-    return float(np.median(errors)) if errors else 0.0
-
-
-def _centre_and_axes(image: pycolmap.Image) -> NDArray[np.float64]:  # [4, 3]
-    """Where a camera is, and the points at distance 1 on its axes: the centres of a straight path alone leave
-    the turn about it open. (1 is the distance of the farthest camera in the normalised world.)
-    """
-    centre: NDArray[np.float64] = image.projection_center()
-    return np.vstack([centre, centre + image.cam_from_world().rotation.matrix()])
+def _colmap_camera(job: Job, number: int) -> pycolmap.Camera:
+    """Return camera ``number`` of the job, from the focal length that its input image states."""
+    camera = pycolmap.Camera(**asdict(job.cameras[number]))
+    if (image := job.exif_images[number]) is not None:
+        apply_exif_focal(camera, image)
+    return camera
 
 
 def _names_in(model: pycolmap.Reconstruction) -> set[str]:

@@ -14,11 +14,11 @@ from cleargs.plugins import load_plugin
 MIN_FRAMES = 3
 """Two frames have no third to confirm what they see."""
 
-LAYOUTS: tuple[Layout, ...] = (video, transforms, colmap, llff, images)
+LAYOUTS: tuple[Layout, ...] = (transforms, colmap, llff, video, images)
 
 
 def layout_of(source: Path, config: CaptureConfig) -> Layout:
-    """The layout that ``ingest.layout`` names; for ``auto``, the first of `LAYOUTS` that knows ``source``."""
+    """Return the layout by ``ingest.layout``; ``auto`` is the first of `LAYOUTS` that detects ``source``."""
     if config.layout != "auto":
         named: Layout = load_plugin("layouts", config.layout)
         return named
@@ -27,21 +27,30 @@ def layout_of(source: Path, config: CaptureConfig) -> Layout:
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """What ingest reads of ``source``: role -> file, folder, or single files by name.
+    """Return all files of ``source`` that ingest reads, by role: a file, a folder, or single files by name.
 
-    A missing input is left to ingest to name. Raises InputError where transforms.json cannot be read.
+    A missing input is reported by ingest.
+
+    Raises:
+        InputError: transforms.json cannot be read.
     """
     return layout_of(source, config).externals(source, config)
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """Find out what ``source`` is and choose its frames. Decodes no frame; changes nothing.
+    """Detect the layout of ``source`` and choose its frames. Decodes no frame and changes nothing.
 
-    Raises InputError.
+    Raises:
+        InputError: the input does not exist, is damaged, or has too few frames.
     """
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, or a folder of images")
     capture = layout_of(source, config).open_capture(source, config)
+    if capture.kind != "video" and (config.start is not None or config.end is not None):
+        raise InputError(
+            f"{source} is not a video: ingest.start and ingest.end choose a part of a video",
+            hint="leave them out, or give the video",
+        )
     if len(capture.frames) < MIN_FRAMES:
         raise InputError(
             f"{source} gives {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",
@@ -51,7 +60,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
 
 
 def frame_size(capture: Capture) -> tuple[int, int] | None:
-    """Width and height of the first frame by its camera or its file's header; None where neither says."""
+    """Return width and height of the first frame by its camera or its file's header; None if unknown."""
     from cleargs.media.image import image_size
     from cleargs.media.video import video_size
 

@@ -46,10 +46,10 @@ class Frame:
     tx: _Translation
     ty: _Translation
     tz: _Translation
-    registered: Annotated[bool, "whether the frame has a pose"]
+    registered: Annotated[bool, "true if the frame has a pose"]
     n_points: Annotated[int, "sparse points that the frame observes"]
     split: Annotated[Literal["train", "test"], "train, or test (held out: has a pose, enters nothing else)"]
-    placed: Annotated[str | None, "how the pose was found, or why there is none"]
+    placed: Annotated[str | None, "method by which the pose was found, or the reason why there is none"]
     mask: str | None
     """No column: path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None."""
 
@@ -100,7 +100,7 @@ def load_frames(ingest_dir: Path) -> list[Frame]:
 
 
 def load_points(ingest_dir: Path) -> Points:
-    """The sparse points of a finished ingest folder. Raises StoreError."""
+    """Return the sparse points of a finished ingest folder. Raises StoreError."""
     table = read_table(ingest_dir / "points.parquet", POINTS)
     get = {name: table.column(name).to_numpy() for name in POINTS.names}
     return Points(
@@ -113,6 +113,6 @@ def load_points(ingest_dir: Path) -> Points:
 
 
 def load_observations(ingest_dir: Path) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """The pairs (frame_id [M], point_id [M]) of a finished ingest folder: P_i of each. Raises StoreError."""
+    """Return the pairs frame_id [M], point_id [M] of a finished ingest folder (P_i). Raises StoreError."""
     table = read_table(ingest_dir / "observations.parquet", OBSERVATIONS)
     return table.column("frame_id").to_numpy(), table.column("point_id").to_numpy()

@@ -21,36 +21,36 @@ _EDGE_SAMPLES = 256
 
 @dataclass(frozen=True)
 class Undistorter:
-    """The way of one camera's images to a pinhole."""
+    """Map from one camera's images to those of a pinhole."""
 
     pinhole: Intrinsics
     """Camera of the published image."""
     _lens: Intrinsics
     _map: tuple[PlaneF32, PlaneF32] | None
-    """Where each pixel of the flat image, which is not reduced yet, lies in the lens's; None without
+    """Position in the lens's image of each pixel of the flat image before it is reduced; None without
     distortion."""
 
     def image(self, rgb: ImageU8) -> ImageU8:  # [H, W, 3]
-        """Bicubic into the flat image, then area averaging to the published size; sRGB throughout."""
+        """Return the published image: bicubic into the flat image, then area averaging, in sRGB."""
         if self._map is not None:
             rgb = np.asarray(cv2.remap(rgb, *self._map, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
         return reduced(rgb, max(self.pinhole.width, self.pinhole.height))
 
     def mask(self, mask: MaskU8) -> MaskU8:  # [H, W]
-        """The same way for a mask, nearest pixels throughout."""
+        """Return the published mask, by nearest pixels."""
         if self._map is not None:
             mask = np.asarray(cv2.remap(mask, *self._map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
         size = (self.pinhole.width, self.pinhole.height)
         return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST))
 
     def points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2]
-        """Pixel positions in the lens's image to those in the published one."""
+        """Return positions in the published image of pixel positions in the lens's image."""
         rays = self._lens.colmap().cam_from_img(np.ascontiguousarray(xy))
         moved: NDArray[np.float64] = np.asarray(rays) * self.pinhole.focal + np.array(self.pinhole.centre)
         return moved
 
     def inside(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:  # [K, 2]
-        """Which positions lie in the published image."""
+        """Return True for each position inside the published image."""
         size = np.array([self.pinhole.width, self.pinhole.height])
         return np.asarray(((xy >= 0) & (xy < size)).all(axis=1))
 
@@ -58,9 +58,12 @@ class Undistorter:
 def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
     """Prepare the undistortion of a camera's images to a long side of at most ``max_size`` px.
 
-    The pinhole keeps the lens's focal lengths, so that the image's centre keeps its scale, and shows the
-    largest rectangle around the axis that the lens's image covers wholly (as COLMAP's undistorter does
-    without blank pixels). Raises InputError when distortion leaves no such rectangle.
+    The pinhole keeps the lens's focal lengths, so that the centre of the image keeps its scale. It shows the
+    largest rectangle around the axis that the lens's image covers wholly, as COLMAP's undistorter does
+    without blank pixels.
+
+    Raises:
+        InputError: the distortion leaves no such rectangle.
     """
     if lens.is_pinhole:
         flat = pinhole(lens.width, lens.height, *lens.focal, *lens.centre)
@@ -71,7 +74,7 @@ def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
     if width < 16 or height < 16:
         raise InputError(
             f"the {lens.model} camera's distortion leaves nothing of its images",
-            hint="check k1..k4, p1, p2, or set ingest.poses=sfm to fit the camera anew",
+            hint="check k1..k4, p1, p2, or set ingest.poses=sfm to find another camera",
         )
     flat = pinhole(width, height, fx, fy, -left * fx, -top * fy)
     x = (np.arange(width) + 0.5 - flat.centre[0]) / fx

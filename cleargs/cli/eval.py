@@ -13,7 +13,6 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import file_digest
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
-from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.run_results import SCENE, scene_stage
@@ -31,6 +30,9 @@ _LABELS = {
     "musiq": "MUSIQ",
     "clip-iqa": "CLIP-\nIQA",
 }
+EXPOSURES_DIFFER = 0.5
+"""Gain of PSNR by aligned colours, dB, from which it is shown."""
+
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
 
@@ -50,7 +52,7 @@ Examples:
 
 \b
 DIR holds images/ and transforms.json in the world of the capture. The result of a run is written into
-RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet beside it; those of other
+RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet next to it. Results of other
 stages and options stay there as long as their scenes do.
 """
 )
@@ -181,16 +183,23 @@ def eval(
         if line := _seen_before(report):
             click.echo(line)
         _print(report, per_image, output)
-        g0 = None if run is None else linked_manifest(run, "g0")
-        if g0 is not None and g0.summary.get("exposure") and not align_colour:  # it was compensated
-            click.echo(
-                "the exposure of each reference counts in these figures: --align-colour leaves it out, as "
-                "the training did"
-            )
+        for line in filter(None, map(_with_colours_aligned, report.evaluations)):
+            click.echo(line)
+
+
+def _with_colours_aligned(evaluation: Evaluation) -> str:
+    """Return the line with the colour-aligned PSNR where exposures differ; "" where they do not."""
+    plain, aligned = evaluation.means.get("psnr"), evaluation.psnr_colour_aligned
+    if plain is None or aligned is None or aligned - plain < EXPOSURES_DIFFER:
+        return ""
+    return (
+        f"{evaluation.subject}: exposures differ: PSNR is {aligned:.2f} dB with the colours aligned to each "
+        f"reference (+{aligned - plain:.2f} dB); --align-colour gives all figures so"
+    )
 
 
 def _older(run: Path, path: Path) -> Report:
-    """The evaluations in ``path`` of scenes that are still those of ``run``."""
+    """Return the evaluations in ``path`` of scenes that ``run`` still has."""
     from cleargs.evaluate.eval_report import Report, read_report
 
     try:
@@ -204,10 +213,10 @@ def _older(run: Path, path: Path) -> Report:
 
 
 def _seen_before(report: Report) -> str:
-    """The line that says how many of the views show frames that a scene was trained on; "" for none."""
+    """Return a line with the number of views that show frames of a training; "" for none."""
     scenes = [found for found in report.evaluations if found.scene is not None]
     if any(found.trained_on is None for found in scenes):
-        return "note: which frames the scene was trained on is not known"
+        return "note: the frames of the scene's training are not known"
     seen = [found for found in scenes if found.trained_on]
     if not seen:
         return ""
@@ -231,7 +240,7 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
         return {target.name: target}
     if not (target / RUN_FILE).is_file():
         raise InputError(
-            f"{target} is no run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
+            f"{target} is not a run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
         )
     if "all" in stages:
         chosen = [name for name in dag.names if (target / name / SCENE).is_file()]
@@ -285,7 +294,7 @@ def _provenance(evaluation: Evaluation) -> str:
 
 
 def _regions(evaluation: Evaluation) -> str:
-    """Where scenes fail that look well on average."""
+    """Return a line on regions in which scenes often fail."""
     parts = {"behind the sparse points": evaluation.far, "clipped in the references": evaluation.clipped}
     words = (
         f"{name} {part.share:.1%} of the pixels, {_figure('psnr', part.psnr)} dB"

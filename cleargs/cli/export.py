@@ -103,13 +103,15 @@ def export(
         if file.exists() and not force:
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
+    import numpy as np
+
     from cleargs.capture.cameras import Similarity
     from cleargs.capture.model import read_model, transform_model, write_model
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.formation.frames import view_of
     from cleargs.splat.camera import cameras_json
     from cleargs.splat.ply import read_ply
-    from cleargs.splat.transforms import transform_scene
+    from cleargs.splat.transforms import far_offset, transform_scene
 
     ingest = run / dag.names[0]
     posed = [frame for frame in load_frames(ingest) if frame.registered]
@@ -135,11 +137,23 @@ def export(
         messages.append(message)
     if sh_degree is not None:
         scene = padded(scene, sh_degree)
+    if world == "input" and (offset := far_offset(scene.gaussians, similarity)):
+        similarity["translation"] = similarity["translation"] - np.array(offset)
+        file = output.with_name(f"{stem}.offset.json")
+        write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
+        messages.append(
+            "single precision would round positions so far from the origin: the files are written without "
+            f"the offset {offset}, which is in {file}"
+        )
     if similarity:
         scene = transform_scene(scene, **similarity)
     if region is not None:
         scene, message = crop_scene(scene, region)
         messages.append(message)
+    if kind == "ply" and 0 < (degree := scene.gaussians.sh_degree) < 3:
+        messages.append(
+            f"spherical harmonics of degree {degree}: for viewers of degree 3 only, --sh-degree 3"
+        )
     if scene.gaussians.num == 0:
         raise InputError("no Gaussian is left", hint="prune or crop less")
     with disk_errors(output):

@@ -45,6 +45,7 @@ PICTURES = ("before_after.png", "candidates.png")
     epilog="""\b
 Examples:
   cleargs run video.mp4 -o room
+  cleargs run video.mp4 -o room --start 3 --end 40        a part of it, in seconds
   cleargs run photos/ -o room --workflow smoke            a quick test
   cleargs run photos/ -o room --quality draft             a first impression with fewer and smaller frames
   cleargs run photos/ -o room --set ingest.max_frames=60 --set rva.tau_R=0.7
@@ -69,6 +70,18 @@ Examples:
     help="Change one setting. `cleargs settings` lists them.",
 )
 @quality_option
+@click.option(
+    "--start",
+    type=click.FloatRange(min=0),
+    metavar="S",
+    help="Take a video from this second on (ingest.start).",
+)
+@click.option(
+    "--end",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="Take a video up to this second (ingest.end).",
+)
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of all random numbers.  [default: 0]")
 @click.option("--reset", is_flag=True, help="Replace the settings of an existing run by those of the recipe.")
 @click.option("--until", metavar="STAGE", help="The last stage to run.")
@@ -88,6 +101,8 @@ def run(
     workflow: str | None,
     overrides: tuple[str, ...],
     quality: tuple[str, ...],
+    start: float | None,
+    end: float | None,
     seed: int | None,
     reset: bool,
     until: str | None,
@@ -103,8 +118,8 @@ def run(
 ) -> int:
     """Turn INPUT into a clean scene in the folder RUN.
 
-    INPUT is a video, an image folder, a COLMAP project (images/ and sparse/0), or a folder with
-    transforms.json or poses_bounds.npy. Existing results are reused, and an interrupted run resumes. An
+    INPUT is a video, a folder of videos or of images, a COLMAP project (images/ and sparse/0), or a folder
+    with transforms.json or poses_bounds.npy. Existing results are reused, and an interrupted run resumes. An
     existing run keeps its settings (RUN/run.toml). Change them with --set, --workflow or --reset.
     """
     dag.until(until)
@@ -114,7 +129,7 @@ def run(
         source,
         folder,
         workflow=workflow,
-        overrides=(*quality, *overrides),
+        overrides=(*quality, *_stretch(start, end), *overrides),
         seed=seed,
         reset=reset,
         store=store,
@@ -138,6 +153,12 @@ def run(
     else:
         print_outcomes(outcomes, settings.folder, page)
     return exit_code(outcomes)
+
+
+def _stretch(start: float | None, end: float | None) -> list[str]:
+    """Return the settings of the options ``--start`` and ``--end``."""
+    values = {"ingest.start": start, "ingest.end": end}
+    return [f"{name}={value}" for name, value in values.items() if value is not None]
 
 
 @click.command(

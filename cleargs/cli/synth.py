@@ -12,7 +12,7 @@ from cleargs.cli.progress_bars import make_reporter
 
 PROTOCOL_HELP = (
     "Degradations: sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, gsotm-mb, gsotm-rs, "
-    "gsotm-mb-rs, gsotm-pn or phone."
+    "gsotm-mb-rs, gsotm-pn, camera or phone."
 )
 
 

@@ -1,4 +1,4 @@
-"""What an evaluation measures, and what it may adjust before measuring."""
+"""Settings of an evaluation: its metrics, and what it may adjust before measuring."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ INSTALLABLE = ("musiq", "clip-iqa")
 """Scorers that the user installs; without them their scores are null."""
 
 SCORERS = ("clarity-net", "naturalness-stats", *INSTALLABLE)
-"""No-reference scorers: the two that ship with ClearGS, and the two of the paper where they are installed."""
+"""No-reference scorers: the two of ClearGS, and the two of the paper if they are installed."""
 
 
 class EvalOptions(FrozenModel):
-    """Which metrics to take besides PSNR and SSIM. Adjustments are off unless asked for, and recorded."""
+    """Metrics in addition to PSNR and SSIM, and adjustments, which are off by default and recorded."""
 
     lpips: tuple[LpipsNet, ...] = Field(LPIPS_NETS, description="Backbones of LPIPS v0.1.")
     scorers: tuple[str, ...] = Field(

@@ -1,11 +1,11 @@
-"""What an evaluation found: ``eval.json`` and its Parquet twin."""
+"""Results of an evaluation: ``eval.json``, and a Parquet table of the same figures."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,17 +31,18 @@ _MEANINGS = {
 _SCORE = "no-reference score; higher is better"
 
 _REGIONS = {
-    "far": "where the scene shows something behind all sparse points of the view, or nothing",
-    "clipped": "where a channel of the reference is at least 254",
+    "far": "in which the scene shows something behind all sparse points of the view, or nothing",
+    "clipped": "with a channel of the reference of at least 254",
 }
 
 LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
-"""All other metrics are better the higher they are."""
+"""Metrics whose lower values are better; of all others the higher values are."""
 
 
 class Figures(FrozenModel):
-    """A record whose JSON writes an infinite figure, as the PSNR of a perfect image, as ``"Infinity"``: JSON
-    has no number for it. Read back, it is a number again.
+    """A record whose JSON writes infinite numbers as ``"Infinity"``, because JSON has no such number.
+
+    The PSNR of a perfect image is infinite. Read from JSON, it is a number again.
     """
 
     model_config = ConfigDict(ser_json_inf_nan="strings")
@@ -50,12 +51,12 @@ class Figures(FrozenModel):
 class Region(Figures):
     """A part of an image, or of all of them."""
 
-    share: float = Field(ge=0, le=1, description="Of the pixels that count.")
-    psnr: float | None = Field(description="dB, of its mean squared error; null where it is empty.")
+    share: float = Field(ge=0, le=1, description="Share of the pixels that count.")
+    psnr: float | None = Field(description="dB, of its mean squared error; null if it is empty.")
 
 
 class Alignment(Figures):
-    """How the reference's poses came into the scene's world."""
+    """Transformation of the reference's poses into the scene's world."""
 
     world: World = Field(
         description="scene: they are in it; ingest: by the similarity of ingest; umeyama: fitted to the "
@@ -71,12 +72,12 @@ class Alignment(Figures):
 
 
 class Refinement(Figures):
-    """What pose refinement changed in one view."""
+    """Changes of one view by pose refinement."""
 
     rotation_deg: float = Field(ge=0, description="Angle turned, degrees.")
     shift: float = Field(ge=0, description="Distance that the camera centre moved, in the scene's units.")
-    loss_before: float = Field(ge=0, description="Mean squared difference at the reduced size, before.")
-    loss_after: float = Field(ge=0, description="The same after the last accepted step.")
+    loss_before: float = Field(ge=0, description="Mean squared difference at full size, before.")
+    loss_after: float = Field(ge=0, description="The same at the pose that was taken.")
 
 
 class ImageResult(Figures):
@@ -85,19 +86,24 @@ class ImageResult(Figures):
     name: str = Field(description="Stem of the reference's file.")
     width: int = Field(ge=1, description="Pixels.")
     height: int = Field(ge=1, description="Pixels.")
-    values: dict[str, float | None] = Field(description="Metric -> value; null where it cannot be had.")
+    values: dict[str, float | None] = Field(description="Metric -> value; null if it is unavailable.")
     prediction: str = Field(description="SHA-256 of the evaluated 8-bit pixels.")
     reference: str = Field(description="SHA-256 of the reference's 8-bit pixels, and of its mask.")
     colour: tuple[tuple[float, ...], ...] | None = Field(
         None, description="The affine [3, 4] on sRGB that colour alignment applied."
     )
-    refinement: Refinement | None = Field(None, description="What pose refinement did.")
+    psnr_colour_aligned: float | None = Field(
+        None, description="dB, after the colours were fitted to the reference by an affine on sRGB."
+    )
+    refinement: Refinement | None = Field(None, description="Changes by pose refinement.")
     far: Region | None = Field(
         None,
-        description="Where the scene shows something behind all sparse points of the view, or nothing; null "
-        "where these are not known.",
+        description="Pixels in which the scene shows something behind all sparse points of the view, or "
+        "nothing; null if these are not known.",
     )
-    clipped: Region | None = Field(None, description="Where a channel of the reference is at least 254.")
+    clipped: Region | None = Field(
+        None, description="Pixels with a channel of the reference of at least 254."
+    )
 
 
 class Evaluation(Figures):
@@ -111,6 +117,9 @@ class Evaluation(Figures):
     alignment: Alignment
     options: EvalOptions
     means: dict[str, float | None] = Field(description="Metric -> mean over the images.")
+    psnr_colour_aligned: float | None = Field(
+        None, description="Mean of `psnr_colour_aligned` over the images; null if `align_colour` is set."
+    )
     far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
     clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
@@ -118,20 +127,20 @@ class Evaluation(Figures):
     trained_on: int | None = Field(
         None,
         ge=0,
-        description="How many of the images show frames that the scene was trained on; null: not known.",
+        description="Number of the images that show frames of the scene's training; null: not known.",
     )
     versions: dict[str, str]
     images: tuple[ImageResult, ...]
 
 
 class Report(Figures):
-    """``eval.json``: evaluations against one reference, one a stage."""
+    """``eval.json``: evaluations against one reference, one per stage."""
 
     schema_version: Literal[1] = 1
     evaluations: tuple[Evaluation, ...]
 
     def merged_with(self, older: Report) -> Report:
-        """These evaluations, then those of ``older`` on the same references that none of these replaces."""
+        """Return these evaluations, then those of ``older`` on the same references that are not replaced."""
         here = {(found.subject, found.poses, found.options) for found in self.evaluations}
         splits = {found.split for found in self.evaluations}
         kept = [
@@ -142,28 +151,30 @@ class Report(Figures):
         return Report(evaluations=(*self.evaluations, *kept))
 
     def document(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the report as JSON values."""
         document: dict[str, Any] = json.loads(self.model_dump_json())
         return document
 
 
 def mean_values(images: Sequence[ImageResult], metrics: Sequence[str]) -> dict[str, float | None]:
-    """The mean of each metric over the images that have it; None where none has."""
-    means: dict[str, float | None] = {}
-    for metric in metrics:
-        values = [value for image in images if (value := image.values[metric]) is not None]
-        means[metric] = math.fsum(values) / len(values) if values else None
-    return means
+    """Return the mean of each metric over the images that have it; None if no image has it."""
+    return {metric: mean_of(image.values[metric] for image in images) for metric in metrics}
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are not None; None if all are."""
+    present = [value for value in values if value is not None]
+    return math.fsum(present) / len(present) if present else None
 
 
 def split_hash(references: Mapping[str, str]) -> str:
-    """SHA-256 over the sorted stems with their references' digests: equal for equal test sets only."""
+    """Return the SHA-256 over the sorted stems and their references' digests, which names a test set."""
     lines = "".join(f"{stem} {digest}\n" for stem, digest in sorted(references.items()))
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
 def write_report(path: Path, report: Report) -> None:
-    """Write ``path`` (.json) and the table beside it (.parquet). Raises StoreError."""
+    """Write ``path`` (.json) and the table next to it (.parquet). Raises StoreError."""
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, report.document())
@@ -174,7 +185,7 @@ def write_report(path: Path, report: Report) -> None:
 
 
 def read_report(path: Path) -> Report:
-    """Read what `write_report` wrote. Raises InputError when it is missing or damaged."""
+    """Read a file of `write_report`. Raises InputError if it is missing or damaged."""
     try:
         return Report.model_validate_json(read_bytes(path))
     except (OSError, ValidationError) as error:
@@ -184,13 +195,11 @@ def read_report(path: Path) -> Report:
 
 
 def table_schema(metrics: Sequence[str]) -> pa.Schema:
-    """The columns of the Parquet twin: one row an image, one column a metric."""
+    """Return the columns of the Parquet table: one row per image, one column per metric."""
     return pa.schema(
         [
             column("subject", pa.string(), "stage, or name of the scene file or of the folder of images"),
-            column(
-                "adjusted", pa.string(), "what was fitted to the reference first: colours, poses, or nothing"
-            ),
+            column("adjusted", pa.string(), "fitted to the reference first: colours, poses, or nothing"),
             column("name", pa.string(), "stem of the reference's file"),
             column("width", pa.int32(), "px"),
             column("height", pa.int32(), "px"),
@@ -199,6 +208,9 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
                 column(f"{region}_{figure}", pa.float64(), words, nullable=True)
                 for region, where in _REGIONS.items()
                 for figure, words in (("share", f"of the pixels, {where}"), ("psnr", f"dB, {where}"))
+            ),
+            column(
+                "psnr_colour_aligned", pa.float64(), "dB, colours aligned to the reference", nullable=True
             ),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
@@ -212,7 +224,7 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
 
 
 def _row(evaluation: Evaluation, image: ImageResult) -> dict[str, Any]:
-    """The columns that one image has; the others of the table are null."""
+    """Return the columns of one image; the others of the table are null."""
     options = evaluation.options
     fitted = ["colours"] if options.align_colour else []
     fitted += [f"poses in {options.refine_poses} steps"] if options.refine_poses else []

@@ -17,7 +17,7 @@ from cleargs.capture.folders import image_files
 from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_values, split_hash
+from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_of, mean_values, split_hash
 from cleargs.evaluate.metrics import (
     apply_affine,
     clipped_pixels,
@@ -47,12 +47,12 @@ _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 
 @dataclass(frozen=True, eq=False)
 class _Prediction:
-    """What a method shows at a reference's view, before colour alignment."""
+    """Image of a method at a reference's view, before colour alignment."""
 
     image: NDArray[np.float64]  # [H, W, 3] sRGB in [0, 1]
     refinement: Refinement | None = None
     far: MaskBool | None = None
-    """Where a scene shows something behind the sparse points; None where these are not known."""
+    """Pixels in which a scene shows something behind the sparse points; None if these are not known."""
 
 
 Predict = Callable[[ReferenceView, ImageU8, MaskBool | None], _Prediction]
@@ -68,16 +68,25 @@ def evaluate_scene(
     subject: str | None = None,
     save: Path | None = None,
 ) -> Evaluation:
-    """Render ``scene`` (a PLY file) at every view of ``reference``, without exposure affines, and measure.
+    """Render ``scene`` at every view of ``reference``, without exposure affines, and measure.
 
-    ``subject`` names it in the result (default: the file's name); ``save`` is a folder for the evaluated
-    images. Results do not depend on ``threads``. Raises InputError for a file that is no scene.
+    Args:
+        scene: PLY file.
+        reference: images to compare with.
+        options: metrics and adjustments.
+        threads: CPU threads; results do not depend on it.
+        reporter: shows progress.
+        subject: name in the result; None: the file's name.
+        save: folder for the evaluated images.
+
+    Raises:
+        InputError: the file is not a scene.
     """
     try:
         loaded = read_ply(scene)
     except StoreError as error:
         raise InputError(
-            f"{scene} is no scene of Gaussians: {str(error).split(': ', 1)[-1]}",
+            f"{scene} is not a scene of Gaussians: {str(error).split(': ', 1)[-1]}",
             hint="give a scene.ply as `cleargs export` or the Inria code writes it",
         ) from error
     set_threads(threads)
@@ -95,14 +104,23 @@ def evaluate_images(
     reporter: Reporter,
     save: Path | None = None,
 ) -> Evaluation:
-    """Measure the images in ``folder`` (any method's), matched with the references by their stems.
+    """Measure the images in ``folder``, of any method, matched with the references by their stems.
 
-    Raises InputError when no stem matches, an image cannot be read, or has another size than its reference.
+    Args:
+        folder: the rendered images.
+        reference: images to compare with.
+        options: metrics and adjustments.
+        threads: CPU threads; results do not depend on it.
+        reporter: shows progress.
+        save: folder for the evaluated images.
+
+    Raises:
+        InputError: no stem matches, an image cannot be read, or has another size than its reference.
     """
     if options.refine_poses:
         raise InputError("finished images have no pose to refine", hint="leave out --refine-poses")
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder of images", hint="give the folder of rendered images")
+        raise InputError(f"{folder} is not a folder of images", hint="give the folder of rendered images")
     files = {path.stem: path for path in sorted(image_files(folder))}
     names = matching(files, [view.name for view in reference.views], "name the images like the references")
     matched = tuple(view for view in reference.views if view.name in names)
@@ -129,7 +147,7 @@ def evaluate_images(
 
 
 def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | None) -> Predict:
-    """Return what renders a scene at references' views, at poses refined by so many steps."""
+    """Return a function that renders a scene at references' views, with poses refined in ``refine_steps``."""
     engine = rasteriser_for(scene.gaussians.device)
 
     def render(camera: Camera) -> NDArray[np.float64]:
@@ -176,10 +194,14 @@ def _evaluate(
             save.mkdir(parents=True, exist_ok=True)
 
     def measured(name: str, prediction: _Prediction, target: ImageU8, mask: MaskBool | None) -> ImageResult:
-        image, affine = prediction.image, None
+        image, affine, aligned_psnr = prediction.image, None, None
+        fitted = fit_affine(image, target / 255.0, mask)
+        aligned = apply_affine(image, fitted)
         if options.align_colour:
-            affine = fit_affine(image, target / 255.0, mask)
-            image = apply_affine(image, affine)
+            image, affine = aligned, fitted
+        else:
+            everywhere = np.ones(target.shape[:2], bool)
+            aligned_psnr = region(to_uint8(aligned), target, everywhere, mask).psnr
         pixels = to_uint8(image)
         if save is not None:
             write_rgb(save / f"{name}.png", pixels)
@@ -191,6 +213,7 @@ def _evaluate(
             prediction=_digest(pixels),
             reference=_digest(target, mask),
             colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
+            psnr_colour_aligned=aligned_psnr,
             refinement=prediction.refinement,
             far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
             clipped=region(pixels, target, clipped_pixels(target), mask),
@@ -221,6 +244,7 @@ def _evaluate(
         alignment=reference.alignment,
         options=options,
         means=mean_values(images, options.metrics),
+        psnr_colour_aligned=mean_of(image.psnr_colour_aligned for image in images),
         far=pooled(image.far for image in images),
         clipped=pooled(image.clipped for image in images),
         unavailable=dict(metrics.unavailable),

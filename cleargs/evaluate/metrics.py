@@ -76,7 +76,7 @@ def ssim(
 
 
 def _windowed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussian mean of the window around each pixel. [H, W, 3]"""
+    """Return the Gaussian mean [H, W, 3] of the window around each pixel."""
     kernel = cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_64F)
     return np.asarray(cv2.sepFilter2D(values, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101))
 
@@ -94,7 +94,7 @@ class MetricSet:
     weights: Mapping[str, str]
     """Metric -> digest of its weights."""
     unavailable: Mapping[str, str]
-    """Metric -> why it cannot be had."""
+    """Metric -> reason why it is unavailable."""
 
     def measure(
         self,
@@ -102,10 +102,9 @@ class MetricSet:
         reference: ImageU8,  # [H, W, 3]
         mask: MaskBool | None,  # [H, W] True = counts
     ) -> dict[str, float | None]:
-        """All metrics of an image; those that cannot be had are None.
+        """Return all metrics of an image; unavailable ones are None.
 
-        LPIPS sees the reference's own pixels where the mask ignores the image's. Scorers, which know no
-        masks, see the whole image.
+        For LPIPS, masked pixels are those of the reference. Scorers have no masks and use the whole image.
         """
         values = {"psnr": psnr(image, reference, mask), "ssim": ssim(image, reference, mask)}
         seen = image if mask is None else np.where(mask[..., None], image, reference)
@@ -168,7 +167,7 @@ def fit_affine(
 
 
 def apply_affine(image: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The image [H, W, 3] through ``affine`` [3, 4], clipped to [0, 1]."""
+    """Return the image [H, W, 3] mapped by ``affine`` [3, 4] and clipped to [0, 1]."""
     mapped: NDArray[np.float64] = np.einsum("hwj,ij->hwi", image, affine[:, :3]) + affine[:, 3]
     return mapped.clip(0.0, 1.0)
 
@@ -180,7 +179,7 @@ def depth_of_points(
     points: NDArray[np.float64],  # [P, 3] in the scene's world
     camera: Camera,
 ) -> float | None:
-    """The depth behind which the view has no sparse points; None where it sees hardly any."""
+    """Return the depth behind which the view has no sparse points; None if it sees fewer than `FEWEST`."""
     x, y, depth = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
@@ -193,24 +192,24 @@ def far_pixels(
     alpha: PlaneF32,  # [H, W]
     farthest: float,
 ) -> MaskBool:
-    """Where a scene shows something behind ``farthest``, or hardly anything."""
+    """Return True for pixels that show something behind ``farthest``, or are more than half transparent."""
     return np.asarray((alpha < 0.5) | (depth > farthest * alpha))
 
 
 def clipped_pixels(reference: ImageU8) -> MaskBool:
-    """Where a channel is at its upper end."""
+    """Return True for pixels with a channel of at least `CLIPPED`."""
     return np.asarray((reference >= CLIPPED).any(axis=-1))
 
 
 def region(image: ImageU8, reference: ImageU8, part: MaskBool, mask: MaskBool | None) -> Region:
-    """What an image is like in ``part`` of those pixels that ``mask`` lets count."""
+    """Return share and PSNR of the pixels in ``part`` that ``mask`` lets count."""
     counting = part if mask is None else part & mask
     pixels = part.size if mask is None else int(mask.sum())
     return Region(share=float(counting.sum()) / max(1, pixels), psnr=psnr(image, reference, counting))
 
 
 def pooled(parts: Iterable[Region | None]) -> Region | None:
-    """The region over all images, each of the same weight: PSNR of the mean squared error over its pixels."""
+    """Return the region over all images, with equal weights of the images and of their squared errors."""
     found = [part for part in parts if part is not None]
     if not found:
         return None

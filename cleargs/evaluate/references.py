@@ -1,4 +1,4 @@
-"""What an evaluation compares with: sharp images, and cameras in the scene's world to render them from."""
+"""References of an evaluation: sharp images, and their cameras in the scene's world."""
 
 from __future__ import annotations
 
@@ -37,11 +37,14 @@ from cleargs.types import ImageU8, MaskBool
 T = TypeVar("T")
 
 LARGE_RESIDUAL = 0.02
-"""Above this share of the trajectory's extent the fit of two worlds deserves a warning."""
+"""Above this share of the trajectory's extent the fit of two worlds causes a warning."""
+
+MAX_RESIDUAL = 0.05
+"""Above this share it is an error: each view would be rendered far from its reference."""
 
 SAME_VIEW = 0.05
-"""Two views are one when their centres are closer than this (the trajectory reaches 1 from its middle), and
-their axes than this in radians: pose noise is smaller, and the next view of a set mostly farther."""
+"""Two views are the same if their centres are closer than this (the trajectory reaches 1 from its middle),
+and their axes than this in radians. Pose noise is smaller, and the next view of a set mostly farther."""
 
 _ROUNDING = 1e-9  # extent of centres, relative to their coordinates, below which they are one place
 _FLAT = 1e-3  # second-largest over largest extent of centres below which the turn about their line is open
@@ -52,19 +55,19 @@ class ReferenceView:
     """One image to compare with."""
 
     name: str
-    """Stem of its file: what it is matched by."""
+    """Stem of its file, by which it is matched."""
     camera: Camera
     """Pinhole of the image, in the scene's world."""
     load: Callable[[], tuple[ImageU8, MaskBool | None]]
-    """Gives the image [H, W, 3] and its mask [H, W] (True counts; None: all do). Raises InputError."""
+    """Returns the image [H, W, 3] and its mask [H, W] (True counts; None: all do). Raises InputError."""
 
     @property
     def pose(self) -> Pose:
-        """Of the camera, in the scene's world."""
+        """Pose of the camera in the scene's world."""
         return Pose(self.camera.world_to_camera[:3, :3], self.camera.world_to_camera[:3, 3])
 
     def at(self, pose: Pose) -> ReferenceView:
-        """The same image, taken from ``pose``."""
+        """Return the same image at ``pose``."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
         return replace(self, camera=replace(self.camera, world_to_camera=matrix))
@@ -79,7 +82,7 @@ class Reference:
     poses: PosesFrom
     alignment: Alignment
     points: NDArray[np.float64] | None = None
-    """The run's sparse points [P, 3], in the scene's world; None where there is no run."""
+    """The run's sparse points [P, 3], in the scene's world; None without a run."""
 
 
 def reference_of(
@@ -90,15 +93,21 @@ def reference_of(
     align: Path | None = None,
     reporter: Reporter,
 ) -> Reference:
-    """What the scenes of a run are compared with, or without one a scene in the world of ``directory``.
+    """Return the reference for the scenes of a run, or for a scene in the world of ``directory``.
 
-    ``directory`` holds ``images/`` and ``transforms.json`` in the world of the run's input; None takes the
-    frames that the run held out. ``poses`` says whether the reference's poses are rendered, or the run's own
-    of the frames with the same stem. Where the run's poses come from SfM, or were refined, the worlds
-    are aligned by the cameras of equal stems: those of the folder ``align``, or of ``directory``
-    without it.
+    If the run's poses are from SfM, or were refined, the worlds are aligned by cameras of equal stems.
 
-    Raises InputError when files are missing or damaged, when stems do not match, or nothing was held out.
+    Args:
+        run: the run; None: a scene in the world of ``directory``.
+        directory: folder with ``images/`` and ``transforms.json`` in the world of the run's input. None: the
+            frames that the run held out.
+        poses: render at the reference's poses, or at the run's own poses of the frames of the same stems.
+        align: folder of the cameras that align the worlds; None: ``directory``.
+        reporter: shows remarks.
+
+    Raises:
+        InputError: files are missing or damaged, stems do not match, worlds do not align, or nothing was held
+            out.
     """
     if run is None:
         if directory is None:
@@ -143,7 +152,7 @@ def reference_of(
 
 
 def matching(found: Iterable[str], wanted: Iterable[str], hint: str) -> list[str]:
-    """The stems that are on both sides; raises InputError, with two examples of each, where there is none."""
+    """Return the stems on both sides. Raises InputError, with two examples of each, if there is none."""
     stems = sorted({*found} & {*wanted}, key=natural_key)
     if not stems:
         raise InputError(
@@ -170,17 +179,17 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         f"worlds aligned by {alignment.matched} cameras of {folder}: residual {alignment.residual:.2%} "
         f"of the trajectory's extent, orientations {alignment.rotation_deg:.2f} degrees apart"
     )
+    hint = "give --align DIR with the poses of the run's own frames: equal stems may be other frames here"
+    if alignment.residual > MAX_RESIDUAL:
+        raise InputError(f"{text}: too large for a comparison", hint=hint)
     if alignment.residual > LARGE_RESIDUAL:
-        reporter.warn(
-            f"{text}: large; if equal stems are not the same frames there, give --align DIR "
-            "with the poses of the run's own frames"
-        )
+        reporter.warn(f"{text}: large; {hint}")
     else:
         reporter.info(text)
 
 
 def _run_pose(frame: Frame) -> Pose:
-    """The pose that the run has of a registered frame."""
+    """Return the run's pose of a registered frame."""
     values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
     numbers = np.array([value for value in values if value is not None], np.float64)
     return Pose.from_quaternion(numbers[:4], numbers[4:])
@@ -193,13 +202,14 @@ def align_cameras(
     source: Sequence[Pose],  # cameras in the world to leave
     target: Sequence[Pose],  # the same ones in the world to enter
 ) -> tuple[Similarity, Alignment]:
-    """The similarity that takes cameras nearest to their like, by place and by direction; how well it fits.
+    """Return the similarity that fits cameras best by place and direction, and its residuals.
 
-    The centres of a handheld walk lie near a line or a plane, and say little about the turn: half a degree
-    may be left, which costs an image decibels. So they only fix the size; then each camera counts as four
-    points, its centre and one on each axis, as far away as the centres spread.
+    The centres of a handheld walk are near a line or a plane and fix only poorly the turn: half a degree may
+    be left, which costs an image decibels. They only fix the size. Then each camera counts as four points:
+    its centre, and one on each axis at the distance by which the centres spread.
 
-    Raises InputError for fewer than three cameras, or centres that lie on one line.
+    Raises:
+        InputError: fewer than three cameras, or centres on one line.
     """
     theirs, ours = (np.stack([pose.centre for pose in poses]) for poses in (source, target))
     scale = umeyama(theirs, ours).scale
@@ -230,11 +240,12 @@ def umeyama(
     source: NDArray[np.float64],  # [N, 3] centres in the world to leave
     target: NDArray[np.float64],  # [N, 3] the same cameras' centres in the world to enter
 ) -> Similarity:
-    """The similarity of least squares from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
+    """Return the least-squares similarity from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
 
-    Raises InputError for fewer than three centres, or centres that lie on one line.
+    Raises:
+        InputError: fewer than three centres, or centres on one line.
     """
-    hint = "give at least three references, taken at places that do not lie on one line"
+    hint = "give at least three references, taken at places that are not on one line"
     if len(source) < 3:
         raise InputError(f"{len(source)} matched frames cannot align two worlds", hint=hint)
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
@@ -243,7 +254,7 @@ def umeyama(
         spread = np.linalg.svd(centred, compute_uv=False)
         if spread[0] <= _ROUNDING * np.abs(places).max() or spread[1] <= _FLAT * spread[0]:
             raise InputError(
-                "the matched cameras stand at one place or on one line, which fixes no turn about it",
+                "the matched cameras are at one place or on one line, which fixes no turn about it",
                 hint=hint,
             )
     u, stretch, vt = np.linalg.svd(np.einsum("ni,nj->ij", b, a) / len(a))
@@ -268,7 +279,7 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
     stems = Counter(stem_of(frame.name) for frame in test)
     for frame in test:
         stem = stem_of(frame.name)
-        if stems[stem] > 1:  # as of the cameras of a rig, in folders of their own
+        if stems[stem] > 1:  # for example the cameras of a rig, in separate folders
             stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
         views.append(ReferenceView(stem, view.camera, view.load))
@@ -276,10 +287,10 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
 
 
 def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
-    """How many views of ``reference`` show frames that the scene of ``stage`` was trained on.
+    """Return the number of views of ``reference`` that show frames of the training of ``stage``.
 
-    These have the stem and about the pose of one. None where nothing is known of them. The frames are the
-    rows of the scene's exposure table, as long as RUN/ingest still has the images that it was made from.
+    Such a view has the stem and about the pose of a frame. The frames are the rows of the scene's exposure
+    table. None if RUN/ingest no longer has the images of the training.
     """
     made, ingest = linked_manifest(run, stage), linked_manifest(run, "ingest")
     if made is None or ingest is None:
@@ -305,11 +316,11 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
 
 
 def _listed(directory: Path) -> dict[str, ReferenceView]:
-    """Stem -> view in the folder's own world, of a folder with ``transforms.json``."""
+    """Return the views of a folder with ``transforms.json``, by stem, in the folder's world."""
     path = directory / "transforms.json"
     if not path.is_file():
         raise InputError(
-            f"{directory} is no reference: it has no transforms.json",
+            f"{directory} is not a reference: it has no transforms.json",
             hint="give a folder with images/ and transforms.json in the world of the run's input",
         )
     entries = read_transforms(path, poses=True)
@@ -330,7 +341,7 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
 
 
 def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, MaskBool | None]:
-    """The pinhole image of a reference, and its mask."""
+    """Return the pinhole image of a reference, and its mask."""
     image, stencil = read_image(frame), read_stencil(frame)
     if image.shape[1::-1] != (lens.width, lens.height):
         raise InputError(
@@ -357,7 +368,7 @@ def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, Ma
 
 
 def stem_of(name: str) -> str:
-    """A file's name without folder and image ending (a video's name may hold dots of its own)."""
+    """Return a file's name without folder and image ending; the name of a video's frame may have dots."""
     path = Path(name)
     return path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
 
@@ -367,8 +378,8 @@ def _by_stem(items: Iterable[tuple[str, T]]) -> dict[str, T]:
     for stem, item in items:
         if stem in found:
             raise InputError(
-                f"two images are called {stem}: they cannot be told apart by their stems",
-                hint="give each image a name of its own",
+                f"two images are called {stem}: their stems do not distinguish them",
+                hint="give each image a different name",
             )
         found[stem] = item
     return found

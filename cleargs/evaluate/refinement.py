@@ -1,7 +1,7 @@
-"""Test-pose refinement: the pose at which a scene explains a reference image best.
+"""Refinement of the pose at which a scene is rendered: the one that explains a reference image best.
 
-Levenberg-Marquardt on the photometric difference at a reduced size. The kernels give no gradient of the
-camera, so the six columns of the Jacobian are central differences.
+Levenberg-Marquardt on the photometric difference, first at a reduced size, then at full size. The kernels
+give no gradient of the camera, so the six columns of the Jacobian are central differences.
 """
 
 from __future__ import annotations
@@ -21,71 +21,108 @@ Render = Callable[[Camera], ArrayF64]
 """Gives [H, W, 3] sRGB in [0, 1]."""
 
 LONG_SIDE = 320
-"""Size at which images are compared, px."""
+"""Reduced size, px: steps reach farther there."""
 
-_BLUR = 1.0  # px; widens the reach of a step to a few pixels
-_DIFFERENCE = 0.25  # px that a probing movement shifts the picture
+_BLUR = 1.0  # px of the reduced image; widens the reach of a step to a few pixels
+_DIFFERENCE = 0.25  # px that a probing movement shifts the image
+_FINE = 0.5
+"""Share of the steps at full size."""
 
 
 def refine_pose(
     render: Render,
     camera: Camera,
-    depth: float,
+    distance: float,
     reference: ImageU8,  # [H, W, 3]
     mask: MaskBool | None,  # [H, W] True = counts
     steps: int,
 ) -> tuple[Camera, Refinement]:
-    """The camera with the pose that lowers the mean squared difference, after ``steps`` steps.
+    """Return the camera with the pose that lowers the mean squared difference, after ``steps`` steps.
 
-    ``depth`` is how far the scene typically is: it makes a unit of movement shift the picture as much as a
-    unit of turning does. A step that does not lower the difference is not taken.
+    A pose is taken only where the difference at full size falls: a pose that fits reduced, blurred images
+    better may be worse there.
+
+    Args:
+        render: renders the scene at a camera.
+        camera: the camera to start from.
+        distance: typical distance of the scene. It makes a unit of movement shift the image as much as a unit
+            of turning does.
+        reference: the image that the scene should explain.
+        mask: pixels that count.
+        steps: steps in all, half of them at full size.
     """
+    fine = max(1, round(_FINE * steps))
     small = camera.scaled(min(1.0, LONG_SIDE / max(camera.width, camera.height)))
-    size = (small.width, small.height)
-    target = np.asarray(cv2.resize(reference / 255.0, size, interpolation=cv2.INTER_AREA))
-    counts = np.ones(target.shape[:2])
-    if mask is not None:  # where every pixel under a reduced one counts
-        covered = cv2.resize(mask.astype(np.float64), size, interpolation=cv2.INTER_AREA)
-        counts = (np.asarray(covered) > 0.999).astype(np.float64)
-    pixel = np.repeat([1.0 / small.fx, depth / small.fx], 3)  # of turning (rad) and of moving (scene units)
+    reduced = _Comparison(render, small, reference, mask, blur=_BLUR)
+    coarse = _descend(reduced, small, distance, steps - fine)
+    whole = _Comparison(render, camera, reference, mask, blur=0.0)
+    first = whole.loss(camera)
+    best = min((camera, replace(camera, world_to_camera=coarse.world_to_camera)), key=whole.loss)
+    refined = _descend(whole, best, distance, fine)
+    return refined, Refinement(
+        rotation_deg=rotation_between(camera.world_to_camera[:3, :3], refined.world_to_camera[:3, :3]),
+        shift=float(np.linalg.norm(refined.centre - camera.centre)),
+        loss_before=first,
+        loss_after=whole.loss(refined),
+    )
 
-    def difference(pose: Camera) -> ArrayF64:
-        masked = (render(pose) - target) * counts[..., None]
-        return np.asarray(cv2.GaussianBlur(masked, (0, 0), _BLUR), np.float64).ravel()
 
-    def loss(residual: ArrayF64) -> float:
-        return float((residual * residual).sum() / max(1.0, 3.0 * counts.sum()))
+class _Comparison:
+    """Differences of renders from one reference, at the size of ``camera``."""
 
-    pose, residual = small, difference(small)
-    first = lowest = loss(residual)
+    def __init__(
+        self, render: Render, camera: Camera, reference: ImageU8, mask: MaskBool | None, *, blur: float
+    ) -> None:
+        size = (camera.width, camera.height)
+        self._render = render
+        self._blur = blur
+        self._target = np.asarray(cv2.resize(reference / 255.0, size, interpolation=cv2.INTER_AREA))
+        self._counts = np.ones(self._target.shape[:2])
+        if mask is not None:  # a reduced pixel counts if every pixel under it does
+            covered = cv2.resize(mask.astype(np.float64), size, interpolation=cv2.INTER_AREA)
+            self._counts = (np.asarray(covered) > 0.999).astype(np.float64)
+
+    def difference(self, pose: Camera) -> ArrayF64:
+        masked = (self._render(pose) - self._target) * self._counts[..., None]
+        if self._blur > 0:
+            masked = np.asarray(cv2.GaussianBlur(masked, (0, 0), self._blur), np.float64)
+        return masked.ravel()
+
+    def mean_square(self, difference: ArrayF64) -> float:
+        return float((difference * difference).sum() / max(1.0, 3.0 * self._counts.sum()))
+
+    def loss(self, pose: Camera) -> float:
+        return self.mean_square(self.difference(pose))
+
+
+def _descend(comparison: _Comparison, pose: Camera, distance: float, steps: int) -> Camera:
+    """Return ``pose`` after ``steps`` steps. A step that does not lower the difference is not taken."""
+    # Turn (rad) and movement (scene units) that shift the image by a pixel.
+    pixel = np.repeat([1.0 / pose.fx, distance / pose.fx], 3)
+    residual = comparison.difference(pose)
+    lowest = comparison.mean_square(residual)
     damping = 1e-3
     normal = gradient = None
     for _ in range(steps):
         if normal is None or gradient is None:
-            jacobian = np.stack(
-                [
-                    difference(apply_twist(pose, axis)) - difference(apply_twist(pose, -axis))
-                    for axis in np.diag(pixel * _DIFFERENCE)
-                ]
-            ) / (2.0 * _DIFFERENCE)
+            probes = [
+                comparison.difference(apply_twist(pose, axis))
+                - comparison.difference(apply_twist(pose, -axis))
+                for axis in np.diag(pixel * _DIFFERENCE)
+            ]
+            jacobian = np.stack(probes) / (2.0 * _DIFFERENCE)
             # einsum, not BLAS, whose order of summation depends on its threads.
             normal = np.einsum("im,jm->ij", jacobian, jacobian)
             gradient = np.einsum("im,m->i", jacobian, residual)
         damped = normal + np.diag(damping * normal.diagonal() + 1e-12)
         candidate = apply_twist(pose, -np.linalg.solve(damped, gradient) * pixel)
-        tried = difference(candidate)
-        if loss(tried) < lowest:
-            pose, residual, lowest = candidate, tried, loss(tried)
+        tried = comparison.difference(candidate)
+        if comparison.mean_square(tried) < lowest:
+            pose, residual, lowest = candidate, tried, comparison.mean_square(tried)
             damping, normal = max(damping / 10.0, 1e-9), None
         else:
             damping = min(damping * 10.0, 1e9)
-    refined = replace(camera, world_to_camera=pose.world_to_camera)
-    return refined, Refinement(
-        rotation_deg=rotation_between(camera.world_to_camera[:3, :3], refined.world_to_camera[:3, :3]),
-        shift=float(np.linalg.norm(refined.centre - camera.centre)),
-        loss_before=first,
-        loss_after=lowest,
-    )
+    return pose
 
 
 def apply_twist(camera: Camera, twist: ArrayF64) -> Camera:

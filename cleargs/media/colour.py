@@ -92,10 +92,11 @@ def light_from_hlg(signal: NDArray[F]) -> NDArray[F]:  # [H, W, 3]
 
 
 def tone_map(light: NDArray[F]) -> NDArray[F]:  # [H, W, 3]
-    """Bend unbounded linear light into [0, 1): the identity up to `KNEE`, above it the shoulder
-    ``knee + (1 - knee) u / (1 + u)`` with ``u = (x - knee) / (1 - knee)``, of slope 1 at the knee.
+    """Compress unbounded linear light to [0, 1).
 
-    x is the largest channel; all three are scaled alike, so that hues stay.
+    It is the identity up to `KNEE`. Above, it is the shoulder ``knee + (1 - knee) u / (1 + u)`` with
+    ``u = (x - knee) / (1 - knee)``, which has slope 1 at the knee. x is the largest channel; all three are
+    scaled by one factor, so that hues stay.
     """
     peak = light.max(axis=-1, keepdims=True)
     u = np.maximum(peak - KNEE, 0) / (1 - KNEE)

@@ -1,4 +1,4 @@
-"""Contact sheets: labelled images in rows, for looking at."""
+"""Contact sheets: labelled images in rows."""
 
 from __future__ import annotations
 
@@ -24,13 +24,16 @@ class Tile(NamedTuple):
     image: AnyImage | None
     """[H, W, 3] sRGB, floats in [0, 1] or bytes; None leaves the place empty."""
     label: str
-    """ASCII; what does not fit is cut off."""
+    """ASCII text, cut off where it does not fit."""
     marked: bool = False
-    """Whether the label stands on green."""
+    """True: the label has a green background."""
 
 
 def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> ImageU8:  # [H, W, 3]
-    """The rows of tiles below one another, each image resampled to ``tile_width`` px. At least one tile."""
+    """Return an image [H, W, 3] of the rows of tiles, each image resampled to ``tile_width`` px.
+
+    There must be at least one tile.
+    """
     lines = [[_cell(tile, tile_width) for tile in row] for row in rows]
     heights = [max(len(cell) for cell in line) + _GAP for line in lines]
     step = tile_width + _GAP
@@ -42,7 +45,7 @@ def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> I
 
 
 def _cell(tile: Tile, width: int) -> ImageU8:
-    """The label above the image."""
+    """Return the image with its label above it."""
     label = np.full((_LABEL_HEIGHT, width, 3), _MARKED if tile.marked else _BACKGROUND, np.uint8)
     cv2.putText(label, tile.label, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
     if tile.image is None:

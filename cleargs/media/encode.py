@@ -28,12 +28,12 @@ _ENCODERS: Mapping[Codec, tuple[str, Mapping[str, str]]] = {
 }
 """Encoder and its settings: constant quality, no visible loss."""
 _AS_IT_COMES = "threads=1:mbtree=0:rc-lookahead=0:bframes=0"
-"""Each frame is coded as it comes, as a phone does. With look-ahead at a held rate x264 gave other bytes from
-call to call, one thread or not."""
+"""Each frame is coded without look-ahead, as a phone does. With look-ahead at a fixed rate x264 gave
+different bytes from call to call, even with one thread."""
 
 
 def require_even(width: int, height: int) -> None:
-    """Raise InputError for a size that no 4:2:0 video can have (it has half as many chroma samples)."""
+    """Raise InputError for an odd size, which no 4:2:0 video can have: it halves the chroma."""
     if width % 2 or height % 2:
         raise InputError(
             f"a video cannot have {width}x{height} pixels", hint="choose an even width and an even height"
@@ -48,14 +48,19 @@ def write_video(
     *,
     codec: Codec = "h264",
 ) -> None:
-    """Write ``frames`` (at least one, taken one by one) as an MP4: 4:2:0, BT.709, limited range, ``fps``
-    frames a second.
+    """Write ``frames`` as an MP4: 4:2:0, BT.709, limited range.
 
-    Without visible loss, or in H.264 at ``bits_per_pixel`` bits a pixel of each frame, held over a second, by
-    one thread, so that equal frames give equal bytes.
+    Args:
+        path: the video.
+        frames: sRGB images, at least one, read one by one.
+        fps: frames per second.
+        bits_per_pixel: bits per pixel, kept over each second, in H.264 by one thread, so that equal frames
+            give equal bytes. None: no visible loss.
+        codec: the codec.
 
-    Raises InputError like `require_even` and where this PyAV has no such encoder, StoreError when the disk is
-    full or not writable.
+    Raises:
+        InputError: an odd size, or this PyAV has no such encoder.
+        StoreError: the disk is full or not writable.
     """
     _require_encoder(codec)
     frames = iter(frames)
@@ -85,7 +90,7 @@ def write_video(
 
 
 def _require_encoder(codec: Codec) -> None:
-    os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 tells all its settings on stderr
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints all its settings on stderr
     try:
         av.codec.Codec(_ENCODERS[codec][0], "w")
     except av.codec.codec.UnknownCodecError:
@@ -96,7 +101,10 @@ def _require_encoder(codec: Codec) -> None:
 
 
 def _planar(rgb: ImageU8) -> VideoFrame:
-    """RGB as 4:4:4 Y'CbCr; swscale only thins out the chroma, since its matrix is several levels off."""
+    """Return RGB as 4:4:4 Y'CbCr.
+
+    swscale only reduces the chroma, because its matrix is several levels off.
+    """
     kr, kb = LUMA["bt709"]
     red, green, blue = np.moveaxis(rgb / 255, -1, 0)
     luma = kr * red + (1 - kr - kb) * green + kb * blue

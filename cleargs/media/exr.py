@@ -1,9 +1,8 @@
 """EXR files of several named RGB layers: scene-linear, Rec.709 primaries, half floats, zip.
 
 Layer ``render`` is the channels ``render.R``, ``render.G``, ``render.B``. OpenEXR stores channels in
-alphabetical order, so they are found by name. One of the layers may be there again as the plain channels R,
-G, B, which programs show that know nothing of layers. Equal layers and attributes give equal bytes: no date
-is stored.
+alphabetical order, so they are found by name. One of the layers may be stored again as the plain channels R,
+G, B, which programs without layers show. Equal layers and attributes give equal bytes: no date is stored.
 """
 
 from __future__ import annotations
@@ -34,27 +33,29 @@ _MAX_CHANNELS = 64
 
 @dataclass(frozen=True, eq=False)
 class LayeredImage:
-    """What an EXR holds: layers by name, and the attributes of its writer (floats in single precision)."""
+    """Content of an EXR: layers by name, and the attributes of its writer (floats in single precision)."""
 
     layers: Mapping[str, Layer]
     attributes: Mapping[str, Attribute]
 
 
 def to_layer(image: ImageF32) -> Layer:
-    """The stored form of an sRGB image [H, W, 3]."""
+    """Return the stored form of an sRGB image [H, W, 3]."""
     return linear_from_srgb(image).astype(np.float16)
 
 
 def from_layer(layer: Layer) -> ImageF32:
-    """The sRGB image [H, W, 3] that a stored layer stands for: what whoever reads the file works with."""
+    """Return the sRGB image [H, W, 3] of a stored layer."""
     return srgb_from_linear(layer.astype(np.float32))
 
 
 def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> None:
     """Write the layers (all of one size) and attributes to ``path``, atomically.
 
-    The layer ``shown`` is also written as the plain channels R, G, B. Raises StoreError when the disk is full
-    or not writable.
+    The layer ``shown`` is also written as the plain channels R, G, B.
+
+    Raises:
+        StoreError: the disk is full or not writable.
     """
     layers = {f"{name}.": layer for name, layer in image.layers.items()}
     if shown is not None:
@@ -69,16 +70,17 @@ def write_view(
     alpha: PlaneF32,  # [H, W]
     depth: PlaneF32,  # [H, W] along the optical axis
 ) -> None:
-    """Write one picture over black as the channels R, G, B, A (half) and Z (float), atomically.
+    """Write one image over black as the channels R, G, B, A (half) and Z (float), atomically.
 
-    Raises StoreError when the disk is full or not writable.
+    Raises:
+        StoreError: the disk is full or not writable.
     """
     layer = to_layer(image).astype(np.float32)
     _write(path, np.dstack([layer, alpha, depth]), dict.fromkeys("RGBA", HALF) | {"Z": FLOAT}, {})
 
 
 def write_depth(path: Path, depth: NDArray[Any]) -> None:  # [H, W]
-    """Write one float channel Z, atomically. Raises StoreError when the disk is full or not writable."""
+    """Write one float channel Z, atomically. Raises StoreError if the disk is full or not writable."""
     _write(path, np.asarray(depth[..., None], np.float32), {"Z": FLOAT}, {})
 
 
@@ -110,7 +112,8 @@ def _write(
 def read_exr(path: Path, prefix: str = "") -> LayeredImage:
     """Read every named RGB layer of ``path``, and the attributes whose name begins with ``prefix``.
 
-    Raises StoreError when the file is missing, damaged, or has a channel outside an RGB layer.
+    Raises:
+        StoreError: the file is missing, damaged, or has a channel outside an RGB layer.
     """
     try:
         open_regular(path).close()
@@ -133,7 +136,7 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
         kept: dict[str, Any] = {
             item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)
         }
-    except FAULTS as error:  # OpenImageIO's own words may hold bytes of the file that are no text
+    except FAULTS as error:  # OpenImageIO's messages may contain bytes of the file that are not text
         raise StoreError(
             f"cannot read {path.name}: {cause(error)}", hint="delete the file and run its stage again"
         ) from error

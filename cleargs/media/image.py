@@ -13,13 +13,26 @@ from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from cleargs.media import MAX_PIXELS
+from cleargs.media.photos import (
+    decode_photo,
+    open_photo,
+    photo_format,
+    photo_orientation,
+    srgb_from_profile,
+)
 from cleargs.safe_io import cause, open_regular, read_bytes
 from cleargs.types import AnyImage, ImageU8, MaskU8
 
-_FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp"})
+_FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp", "jpegxl"})
 """Formats that are read, as OpenImageIO names them."""
 
+_PHOTOS = frozenset({"heic", "avif"})
+"""Formats that Pillow reads."""
+
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
+
+_METADATA = 2**18
+"""Bytes at the start of a file in which its metadata are."""
 
 _HINT = "copy the file again, convert it to JPEG or PNG, or remove it"
 
@@ -30,54 +43,96 @@ _MIRRORED = {
 
 
 class Header(NamedTuple):
-    """What the first bytes of an image file state: what decoding takes is known before."""
+    """Values in the header of an image file, from which the cost of decoding is known before."""
 
     width: int
     height: int
     orientation: int
-    """EXIF's, 1 to 8, and 1 where there is none."""
+    """EXIF's orientation, 1 to 8; 1 if there is none."""
     format: str
+    profile: bytes = b""
+    """The embedded ICC profile; empty if there is none."""
 
 
 def read_header(path: Path) -> Header:
-    """The header of the image in ``path``. Raises InputError when there is no image."""
+    """Return the header of the image in ``path``. Raises InputError if there is no image."""
     from OpenImageIO import ImageInput, geterror
 
     try:
         with open_regular(path) as file:
-            empty = not file.read(1)
+            head = file.read(12)
     except OSError as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
+    if kind := photo_format(head):
+        with open_photo(path, kind) as photo:
+            profile = photo.info.get("icc_profile") or b""
+            return Header(*photo.size, photo_orientation(photo), kind, profile)
     source = ImageInput.open(str(path))
     if source is None:
         geterror()  # else OpenImageIO prints it on stderr at the end
     elif source.format_name() in _FORMATS:
         spec = source.spec()
         noted = spec.get_int_attribute("Orientation", 1)
-        return Header(spec.width, spec.height, noted if 1 <= noted <= 8 else 1, source.format_name())
-    fault = "is empty (zero bytes)" if empty else "is not an image that can be read"
+        profile = spec.getattribute("ICCProfile")
+        return Header(
+            spec.width,
+            spec.height,
+            noted if 1 <= noted <= 8 else 1,
+            source.format_name(),
+            b"" if profile is None else bytes(profile),
+        )
+    fault = "is empty (zero bytes)" if not head else "is not an image that can be read"
     raise InputError(f"{path} {fault}", hint=_HINT)
 
 
+def lens_name(path: Path) -> tuple[str, ...]:
+    """Return camera, lens and focal lengths by the EXIF of the image in ``path``.
+
+    Phones have several lenses whose images are of one size.
+    """
+    from OpenImageIO import ImageInput, geterror
+
+    source = ImageInput.open(str(path))
+    if source is None:
+        geterror()
+        return ()
+    names = ("Model", "Exif:LensModel", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm")
+    values = (source.spec().getattribute(name) for name in names)
+    return tuple(f"{value:.1f}" if isinstance(value, float) else str(value) for value in values)
+
+
+def is_panorama(path: Path) -> bool:
+    """Return True if the metadata of the image in ``path`` say that it is equirectangular (XMP's GPano)."""
+    with open_regular(path) as file:
+        return b"equirectangular" in file.read(_METADATA)
+
+
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of the image in ``path``, as it is stored. Raises InputError like `read_header`."""
+    """Return width and height of the stored image in ``path``. Raises InputError like `read_header`."""
     header = read_header(path)
     return header.width, header.height
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
-    """The image in ``path`` as 8-bit sRGB; alpha is dropped, 16 bits are reduced to 8.
+    """Return the image in ``path`` as 8-bit sRGB [H, W, 3].
 
-    ``upright`` turns it as its EXIF orientation says. Raises InputError when there is no readable image.
+    Alpha is dropped, 16 bits are reduced to 8, and an ICC profile is converted to sRGB.
+
+    Args:
+        path: the image file.
+        upright: turn it by its EXIF orientation.
+
+    Raises:
+        InputError: there is no readable image.
     """
     bgr = _decode(path, cv2.IMREAD_COLOR, upright=upright)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_mask(path: Path) -> MaskU8:  # [H, W]
-    """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`.
+    """Return a mask [H, W]: 0 if the pixel is ignored, else 255. Raises InputError like `read_rgb`.
 
-    The border lies in the middle, of masks of 0 and 1 alone, as some programs write them, above 0.
+    The threshold is 127, or 0 for masks of 0 and 1, which some programs write.
     """
     grey = _decode(path, cv2.IMREAD_GRAYSCALE)
     border = 127 if grey.max() > 1 else 0
@@ -85,9 +140,9 @@ def read_mask(path: Path) -> MaskU8:  # [H, W]
 
 
 def read_alpha(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
-    """The transparency of an image as a mask: 0 where it is more transparent than not, else 255.
+    """Return the transparency of an image as a mask: 0 if it is more than half transparent, else 255.
 
-    None where it is opaque all over. ``upright`` turns it as `read_rgb` does. Raises InputError like it.
+    None if it is opaque everywhere. ``upright`` turns it, and errors are raised, as `read_rgb` does.
     """
     if path.suffix.lower() in _OPAQUE:
         return None
@@ -120,16 +175,16 @@ def write_mask(path: Path, mask: MaskU8) -> None:  # [H, W]
 
 
 def to_uint8(image: AnyImage) -> ImageU8:
-    """Floats in [0, 1] (clipped) rounded to 0..255; an image of bytes stays as it is."""
+    """Return floats in [0, 1] (clipped) rounded to 0..255; an image of bytes stays unchanged."""
     if image.dtype == np.uint8:
         return image
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
 def _decode(path: Path, flags: int, *, upright: bool = True) -> AnyImage:
-    """The image [H, W, ...] as it is to be seen (``upright``) or as it is stored.
+    """Return the image [H, W, ...], turned by its EXIF orientation (``upright``) or as it is stored.
 
-    It is decoded from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr.
+    It is decoded from memory, because OpenCV's file reader explains a failure only on stderr.
     """
     header = read_header(path)
     if header.width * header.height > MAX_PIXELS:
@@ -137,18 +192,11 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> AnyImage:
             f"{path} has {header.width}x{header.height} pixels; at most {MAX_PIXELS} are read",
             hint="reduce the image: no more than ingest.max_size of its long side is used anyway",
         )
-    try:
-        content = read_bytes(path)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
-    image = None
-    # libpng would tell of a file that breaks off on stderr.
-    if header.format != "png" or b"IEND" in content:
-        with suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path} is not an image that can be read", hint=_HINT)
-    # It is as stored, unless it is a TIFF: OpenCV turns these whatever the flags are.
+    image = _stored(path, header, flags)
+    if header.profile and flags == cv2.IMREAD_COLOR:
+        rgb = np.ascontiguousarray(image[..., ::-1])
+        image = srgb_from_profile(rgb, header.profile)[..., ::-1]
+    # The image is as it is stored, except a TIFF, which OpenCV always turns.
     turn = header.orientation
     if header.format == "tiff":
         turn = 1 if upright else {6: 8, 8: 6}.get(turn, turn)  # the others undo themselves
@@ -158,3 +206,42 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> AnyImage:
         image = image.swapaxes(0, 1)
     down, across = _MIRRORED[turn]
     return np.ascontiguousarray(image[::down, ::across])
+
+
+def _stored(path: Path, header: Header, flags: int) -> AnyImage:
+    """Return the image as it is stored, in OpenCV's order of channels, as its ``flags`` ask for it."""
+    if header.format in _PHOTOS:
+        with open_photo(path, header.format) as photo:
+            return _as_flags_ask(decode_photo(path, photo), flags)
+    try:
+        content = read_bytes(path)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
+    image: AnyImage | None = None
+    if header.format == "jpegxl":
+        from OpenImageIO import ImageInput, geterror
+
+        source = ImageInput.open(str(path))
+        pixels = None if source is None else source.read_image("uint8")
+        if pixels is not None and pixels.ndim == 3:
+            image = _as_flags_ask(pixels if pixels.shape[2] > 2 else pixels[..., [0, 0, 0]], flags)
+        geterror()  # else OpenImageIO prints it on stderr at the end
+    # libpng would report a truncated file on stderr.
+    elif header.format != "png" or b"IEND" in content:
+        with suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"{path} is not an image that can be read", hint=_HINT)
+    return image
+
+
+def _as_flags_ask(pixels: ImageU8, flags: int) -> ImageU8:  # [H, W, 3 or 4] RGB(A)
+    """Return ``pixels`` as OpenCV's flags of `imdecode` ask for them."""
+    alpha = pixels.shape[2] == 4
+    if flags == cv2.IMREAD_UNCHANGED:
+        code = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR
+    elif flags == cv2.IMREAD_GRAYSCALE:
+        code = cv2.COLOR_RGBA2GRAY if alpha else cv2.COLOR_RGB2GRAY
+    else:
+        code = cv2.COLOR_RGBA2BGR if alpha else cv2.COLOR_RGB2BGR
+    return np.asarray(cv2.cvtColor(pixels, code), np.uint8)

@@ -1,21 +1,25 @@
 """Frames of a video as upright 8-bit sRGB, through PyAV.
 
-Presentation times, rotation, matrix, range and transfer are the stream's. Where it is silent: limited
-range, BT.709 from 720 lines on and BT.601 below, as players do. Standard dynamic range is taken for sRGB as
-it stands (a display shows both alike); HLG and PQ go through `cleargs.media.colour.srgb_from_hdr`.
+Presentation times, rotation, matrix, range and transfer are the stream's. Without them: limited range, BT.709
+from 720 lines on and BT.601 below, as players do. Standard dynamic range is treated as sRGB without change,
+because a display shows both alike. HLG and PQ go through `cleargs.media.colour.srgb_from_hdr`.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from av.filter import Graph
+from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
@@ -29,14 +33,16 @@ from cleargs.types import ImageF32, ImageU8
 _MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
 _TRANSFERS = {16: "pq", 18: "hlg"}
 _FULL_RANGE = 2
+_PREVIEW = 0.1
+_PROGRESSIVE = 1  # AVFieldOrder: 0 is unknown, above 1 are those of two fields
 _SLACK_S, _SLACK = 0.5, 0.02
-"""By how much a video may end before its container says, s and as a share: frame durations are rounded."""
+"""Time by which a video may end before its container says, s and as a share: frame durations are rounded."""
 _HINT = "copy the file again, or re-encode what is readable: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4"
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """When each frame of a video is shown."""
+    """Presentation times of the frames of a video."""
 
     pts: tuple[int, ...]
     """Presentation time stamps, ascending."""
@@ -44,16 +50,30 @@ class Timeline:
     """Seconds per unit of ``pts``."""
     transfer: str | None
     """``pq`` or ``hlg`` for HDR, else None."""
+    interlaced: bool = False
+    """True if each frame has two fields. They are deinterlaced when they are decoded."""
+    others: int = 0
+    """Number of other streams in the file that are videos, not pictures."""
+    before: tuple[int, ...] = ()
+    """Time stamps of the frames that were cut off at the start."""
 
     def seconds(self, index: int) -> float:
-        """Presentation time of a frame, from the first one on, s."""
-        return (self.pts[index] - self.pts[0]) * self.time_base
+        """Return the presentation time of a frame from the first one of the file on, s."""
+        return (self.pts[index] - (self.before or self.pts)[0]) * self.time_base
+
+    def between(self, start: float | None, end: float | None) -> Timeline:
+        """Return the part from ``start`` to ``end``, s, both included. It may have no frame."""
+        times = [self.seconds(index) for index in range(len(self.pts))]
+        first = 0 if start is None else bisect_left(times, start)
+        last = len(times) if end is None else bisect_right(times, end)
+        return replace(self, pts=self.pts[first:last], before=self.before + self.pts[:first])
 
 
 def read_timeline(path: Path) -> Timeline:
     """Read the time stamps of ``path`` without decoding it.
 
-    Raises InputError when it is no video, empty, or breaks off.
+    Raises:
+        InputError: it is not a video, is empty, or breaks off.
     """
     with _open(path) as (container, stream):
         pts: list[int] = []
@@ -75,11 +95,13 @@ def read_timeline(path: Path) -> Timeline:
         if short or (stream.frames > len(pts) + 1 and not edited):
             raise _broken(path, len(pts), stream)
         transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
-        return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer)
+        interlaced = int(stream.codec_context.field_order) > _PROGRESSIVE
+        others = len(_by_merit(path)) - 1 if len(container.streams.video) > 1 else 0
+        return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer, interlaced, others)
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Width and height of the frames, from the header of ``path``. Raises InputError like `read_timeline`."""
+    """Return width and height of the frames by the header of ``path``. Raises InputError."""
     with _open(path) as (_, stream):
         return stream.codec_context.width, stream.codec_context.height
 
@@ -87,7 +109,8 @@ def video_size(path: Path) -> tuple[int, int]:
 def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
     """Decode ``path`` once and yield (pts, RGB [H, W, 3]) of the wanted frames, one in memory at a time.
 
-    Raises InputError when a wanted frame cannot be decoded, or has too many pixels.
+    Raises:
+        InputError: a wanted frame cannot be decoded, or has too many pixels.
     """
     missing = set(pts)
     for number, frame, aspect in _decoded(path, pts):
@@ -100,20 +123,22 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, Image
 
 
 def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
-    """Like `decode_frames`, but grey [H, W] and as the frames are stored: several times as fast. Frames that
-    cannot be decoded, as at the start of a clip that was cut out of another, are left out.
+    """Yield frames like `decode_frames`, but grey [H, W] and as they are stored.
+
+    It is several times as fast. Frames that cannot be decoded, for example at the start of a clip that was
+    cut out of another, are left out.
     """
     for number, frame, _ in _decoded(path, pts):
         yield number, np.asarray(frame.to_ndarray(format="gray"), np.uint8)
 
 
 def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame, float]]:
-    """The wanted frames that can be decoded, and the width of their pixels over the height."""
+    """Yield the wanted frames that can be decoded, with the width of their pixels over the height."""
     wanted = set(pts)
     last = max(wanted)
     with _open(path) as (container, stream):
         stream.thread_type = "AUTO"
-        for frame in container.decode(stream):
+        for frame in _progressive(container, stream):
             if frame.pts is None or frame.pts > last:
                 continue
             if frame.pts in wanted:
@@ -123,13 +148,35 @@ def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame
                 return
 
 
+def _progressive(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    """Decode ``stream``; where its header says that it is interlaced, through FFmpeg's deinterlacer (bwdif).
+
+    Each frame keeps its time and shows the moment of its first field.
+    """
+    if int(stream.codec_context.field_order) <= _PROGRESSIVE:
+        yield from container.decode(stream)
+        return
+    graph = Graph()
+    graph.link_nodes(
+        graph.add_buffer(template=stream), graph.add("bwdif", "mode=send_frame"), graph.add("buffersink")
+    ).configure()
+    for frame in (*container.decode(stream), None):
+        graph.vpush(frame)
+        with suppress(av.error.BlockingIOError, av.error.EOFError):  # it asks for the next, or is through
+            while True:
+                made = graph.vpull()
+                if made.pts is not None and made.time_base and stream.time_base:
+                    made.pts = round(made.pts * made.time_base / stream.time_base)
+                yield made
+
+
 def _require_few(subject: str, width: int, height: int, what: str = "pixels") -> None:
     if width * height > MAX_PIXELS:
         raise InputError(f"{subject} {width}x{height} {what}; at most {MAX_PIXELS} are read", hint=_HINT)
 
 
 def _oriented(frame: VideoFrame, width: int) -> ImageU8:  # [H, W, 3]
-    """A decoded frame as upright sRGB; ``width`` is that with square pixels, before it is turned."""
+    """Return a decoded frame as upright sRGB; ``width`` is that with square pixels, before it is turned."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
     if width != frame.width:
         rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -137,10 +184,10 @@ def _oriented(frame: VideoFrame, width: int) -> ImageU8:  # [H, W, 3]
 
 
 def _signal(frame: VideoFrame) -> ImageF32:  # [H, W, 3]
-    """R'G'B' of a Y'CbCr frame, tone-mapped to sRGB where it is HDR.
+    """Return R'G'B' of a Y'CbCr frame, tone-mapped to sRGB if it is HDR.
 
-    swscale only brings chroma to full resolution, at the stream's own depth and range: its matrix
-    tables are up to several levels off.
+    swscale only raises chroma to full resolution, at the stream's depth and range, because its matrix tables
+    are up to several levels off.
     """
     bits = max(component.bits for component in frame.format.components)
     full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
@@ -160,7 +207,7 @@ def _signal(frame: VideoFrame) -> ImageF32:  # [H, W, 3]
 
 @contextmanager
 def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open the first video stream; every FFmpeg error inside the block becomes an InputError."""
+    """Open the best video stream. Every FFmpeg error inside the block becomes an InputError."""
     try:
         with open_regular(path) as file:
             if not file.read(1):
@@ -170,8 +217,12 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             if not container.streams.video:
                 raise InputError(f"{path.name} holds no video", hint="give a video, or a folder of images")
             stream = container.streams.video[0]
-            if stream.codec_context is None:  # of a form that FFmpeg does not know
+            if len(container.streams.video) > 1:
+                stream = container.streams.video[_by_merit(path)[0]]
+            if stream.codec_context is None:  # FFmpeg does not know its form
                 raise InputError(f"{path.name} is in a form that cannot be decoded", hint=_HINT)
+            if min(stream.width, stream.height) < 1:
+                raise InputError(f"{path.name} is damaged: its header gives the picture no size", hint=_HINT)
             _require_few(f"{path.name} has", stream.width, stream.height)
             yield container, stream
     except (av.error.FFmpegError, OSError) as error:
@@ -179,8 +230,27 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         raise InputError(f"{path.name} cannot be read as a video: {reason}", hint=_HINT) from error
 
 
+def _by_merit(path: Path) -> list[int]:
+    """Return the numbers of the video streams in ``path``, best first, without attached and single pictures.
+
+    The best has the most pixels over all its frames, which are counted. One with less than a tenth of them is
+    a preview.
+    """
+    with av.open(path, metadata_errors="replace") as container:
+        streams = container.streams.video
+        frames = Counter(packet.stream_index for packet in container.demux(streams) if packet.size)
+        merit = {
+            number: frames[stream.index] * stream.width * stream.height
+            for number, stream in enumerate(streams)
+            if not stream.disposition & Disposition.attached_pic
+        }
+    best = max(merit.values(), default=0)
+    kept = [number for number in merit if merit[number] >= _PREVIEW * best]
+    return sorted(kept, key=lambda number: -merit[number]) or [0]
+
+
 def _stated_seconds(container: InputContainer, stream: VideoStream) -> float:
-    """Until when a Matroska video should last, s; 0 where the file does not say, or counts its frames anyway.
+    """Return the length of a Matroska video, s; 0 if the file does not state it, or counts its frames.
 
     Its one length is that of the longest stream, so it speaks for the video only where that is alone.
     """

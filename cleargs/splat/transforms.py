@@ -34,6 +34,21 @@ _DIRECTIONS = 64
 """Number of directions in which two SH functions are compared; 16 coefficients need at least 16."""
 
 
+ROUNDED = 0.1
+"""Step of single precision, as a share of the median size of the Gaussians, from which positions suffer."""
+
+
+def far_offset(gaussians: Gaussians, similarity: Mapping[str, Any]) -> list[float]:
+    """Return whole units to leave out of the translation of ``similarity``; empty where none need be.
+
+    Map coordinates (UTM) have millions of metres, where single precision has steps of half a metre.
+    """
+    translation = np.asarray(similarity["translation"], np.float64)
+    size = float(similarity["scale"]) * float(torch.exp(gaussians.log_scales.median()))
+    step = float(np.spacing(np.float32(np.abs(translation).max())))
+    return np.round(translation).tolist() if step > ROUNDED * size else []
+
+
 def transform_scene(
     scene: Scene,
     *,

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,3 +95,31 @@ def disc(count: int, radius: float) -> ArrayF64:
     angle = number * math.pi * (3 - math.sqrt(5))
     unit = np.sqrt(number / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
     return np.asarray(radius * unit, np.float64)
+
+
+def distorted(
+    light: ArrayF64,  # [H, W, 3]
+    lens: Lens,
+    coefficients: tuple[float, float, float, float],
+) -> ArrayF64:  # [H, W, 3]
+    """Return what a lens with distortion makes of the image of ``lens``, which has none.
+
+    Args:
+        light: image in linear light.
+        lens: lens of ``light``.
+        coefficients: k1, k2, p1 and p2 of OpenCV's model. The ray of each pixel is found by fixed-point
+            iteration. Pixels whose ray is outside the image repeat its border.
+    """
+    k1, k2, p1, p2 = coefficients
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    seen = np.stack([(columns - lens.cx) / lens.fx, (rows - lens.cy) / lens.fy])
+    x, y = seen
+    for _ in range(20):
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        x, y = (seen[0] - dx) / radial, (seen[1] - dy) / radial
+    where = [(axis - 0.5).astype(np.float32) for axis in (x * lens.fx + lens.cx, y * lens.fy + lens.cy)]
+    found = cv2.remap(light, where[0], where[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.maximum(np.asarray(found, np.float64), 0.0)

@@ -42,6 +42,10 @@ class Protocol:
     """Standard deviation per axis of the rotation error of the given poses, degrees."""
     translation_noise: float = 0.0
     """Standard deviation per axis of the error of the given camera centres, as a share of the mean depth."""
+    focal_error: float = 0.0
+    """Error of the given focal length, as a share of the true one."""
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1 and p2 of the lens (OpenCV's model), of which the input says nothing."""
     mixed: bool = False
     """Use faults per frame instead: see `_mixed`."""
     jpeg: int | None = None
@@ -63,6 +67,13 @@ PROTOCOLS: dict[str, Protocol] = {
     "gsotm-rs": Protocol(skew=12),
     "gsotm-mb-rs": Protocol(blur=8, skew=12),
     "gsotm-pn": Protocol(rotation_noise=0.4, translation_noise=0.005),
+    # As with a depth sensor: the focal length of 7-Scenes is 13 % off, and its poses miss by 1.7 px.
+    "camera": Protocol(
+        rotation_noise=0.4,
+        translation_noise=0.005,
+        focal_error=0.06,
+        distortion=(0.08, -0.03, 0.001, -0.001),
+    ),
     # Every fifth frame of a video with 30 frames per second and a shutter that is open 5/6 of the time.
     "phone": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True),
 }

@@ -21,7 +21,7 @@ from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
-from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, instant_shutter
+from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, distorted, instant_shutter
 from cleargs.synth.path import FPS, HandheldPath, SceneSetup, frame_times
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, encode_and_decode, metered_luminance, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan_faults
@@ -140,6 +140,8 @@ def make_capture(
         for number, (motion, fault, nearness) in enumerate(zip(motions, faults, nearnesses, strict=True)):
             rng = np.random.default_rng([seed, Stream.EXPOSURES, number])
             light, seen = _expose(setup, motion, fault, nearness, rng)
+            if any(rules.distortion):
+                light = distorted(light, setup.lens, rules.distortion)
             shots.append(develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
             moving = {"moving_share": float((seen > 0).mean())}
             rows.append(_row(number, images[number], motion, fault) | processing | moving)
@@ -177,10 +179,14 @@ def make_capture(
         "rolling_shutter_px": _distribution([row["rolling_shutter_px"] for row in rows]),
         "px_at_640": REFERENCE_WIDTH / width,
         "mean_depth": mean_depth,
+        "focal_error": rules.focal_error,
+        "distortion": list(rules.distortion),
         "pose_noise": noise if any(noise.values()) else None,  # standard deviations per axis
     }
     write_json(out / "truth" / "capture.json", summary)
-    _write_transforms(out, setup.lens, images, given)
+    wrong = 1 + rules.focal_error
+    lens = replace(setup.lens, fx=wrong * setup.lens.fx, fy=wrong * setup.lens.fy)
+    _write_transforms(out, lens, images, given)
     return summary
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cleargs.capture.sfm_worker import OUTCOME
+from cleargs.capture.sfm_job import OUTCOME
 from cleargs.digest import file_digest
 from cleargs.files import remove
 from cleargs.manifest import published_files

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from OpenImageIO import ImageOutput, ImageSpec
+from PIL import Image
 from pydantic import ValidationError
 
 from cleargs.capture.cameras import Intrinsics, Pose, normalise, pinhole
@@ -390,6 +391,19 @@ def test_every_camera_has_the_exif_of_an_image_of_its_own(images: Path) -> None:
     apart = job_of(frames, None, images, IngestConfig(shared_camera=False), 0, 1).exif_images
     assert apart == [(images / f"{k}.jpg").resolve() for k in range(3)]
     assert job_of(frames, None, images, IngestConfig(), 0, 1).exif_images == apart[:1]
+
+
+def test_frames_of_one_lens_share_a_camera(tmp_path: Path) -> None:
+    """A phone's main and wide camera give images of one size."""
+    frames = []
+    for index, focal in enumerate((28, 13, 28, 13)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA405] = focal  # FocalLengthIn35mmFilm
+        path = tmp_path / f"{index}.jpg"
+        Image.new("RGB", (60, 40)).save(path, exif=exif)
+        frames.append(WorkFrame(SourceFrame(path.name, path), f"{index:06d}.png", 60, 40, False, None))
+    job = job_of(frames, None, tmp_path, IngestConfig(), 0, 1)
+    assert job.camera_of == [0, 1, 0, 1] and len(job.exif_images) == 2
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])

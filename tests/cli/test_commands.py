@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from toy import Bench
@@ -21,6 +22,7 @@ from cleargs.cli.run import print_outcomes
 from cleargs.cli.show import describe_table, sampled_rows
 from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
+from cleargs.media.encode import write_video
 from cleargs.parquet import column
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import usable_cores
@@ -606,3 +608,14 @@ def test_gc_refuses_a_folder_that_is_not_a_store(shell: Shell, tmp_path: Path) -
         assert code == 2 and "is not a store" in errors
     assert thesis.is_file()
     assert "reused: count, square, total" in shell.run()[1]
+
+
+def test_stretch_of_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """``--start`` and ``--end`` are settings of ingest."""
+    frames = [np.full((64, 96, 3), 8 * index, np.uint8) for index in range(30)]
+    write_video(tmp_path / "walk.mp4", frames, 10.0)
+    common = ["run", str(tmp_path / "walk.mp4"), "-o", str(tmp_path / "run"), "--until", "ingest"]
+    assert invoke([*common, "--start", "2", "--end", "1"]) == 2
+    assert "between ingest.start and ingest.end: it lasts 2.9 s" in capsys.readouterr().err
+    assert invoke([*common, "--start", "1", "--end", "2.05"]) == 1  # nothing in these frames can be matched
+    assert "11 of 11 frames" in capsys.readouterr().err

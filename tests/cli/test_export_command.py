@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 sys.path.append(str(Path(__file__).parents[1] / "evaluate"))
 
+import eval_world
 from colmap_model import write_sparse
 from eval_world import cameras, make_scene, write_run
 
@@ -65,3 +68,21 @@ def test_nothing_left_to_crop_is_an_error() -> None:
     for region in ((98.0,), (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)):
         with pytest.raises(InputError, match="no Gaussian is left"):
             crop_scene(empty, region)
+
+
+def test_map_coordinates_keep_their_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the millions of metres of a map grid, single precision has steps of half a metre."""
+    utm = np.array([583960.0, 5402812.0, 412.0])
+    monkeypatch.setattr(eval_world, "WORLD", replace(eval_world.WORLD, origin=eval_world.WORLD.origin + utm))
+    run = write_run(tmp_path / "far", make_scene(count=20), cameras())
+    write_sparse(run / "ingest")
+    assert export(run, tmp_path / "x.ply", "--world", "input") == 0
+    assert "x.offset.json" in capsys.readouterr().out
+    offset = np.array(json.loads((tmp_path / "x.offset.json").read_text())["offset"])
+    assert np.abs(offset - utm).max() < 10
+    near = read_ply(tmp_path / "x.ply").gaussians
+    assert float(near.means.abs().max()) < 100 and len(near.means[:, 0].unique()) == 20
+    first = json.loads((tmp_path / "x.cameras.json").read_text())[0]["position"]
+    assert np.abs(first).max() < 100  # all files share the offset

@@ -136,7 +136,7 @@ def test_views_of_frames_that_were_trained_on_are_told_from_others(
     _, out, _ = shell(run, "--reference", novel, *FAST)
     assert "trained on" not in out
     _, out, _ = shell(run / "g0" / "scene.ply", "--reference", truth, *FAST)
-    assert out.startswith("note: which frames the scene was trained on is not known\n")
+    assert out.startswith("note: the frames of the scene's training are not known\n")
 
 
 def test_an_evaluation_stays_beside_those_of_other_stages_and_options(
@@ -186,8 +186,10 @@ def test_a_run_without_held_out_frames(shell: Shell, tmp_path: Path) -> None:
 
 def test_not_a_splat(shell: Shell, truth: Path, tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
-    fails(shell(tmp_path / "mesh.ply", "--reference", truth, *FAST), "mesh.ply", "no scene of Gaussians")
-    fails(shell(truth / "images" / "000.png", "--reference", truth, *FAST), "no scene of Gaussians")
+    fails(
+        shell(tmp_path / "mesh.ply", "--reference", truth, *FAST), "mesh.ply", "is not a scene of Gaussians"
+    )
+    fails(shell(truth / "images" / "000.png", "--reference", truth, *FAST), "is not a scene of Gaussians")
 
 
 def test_a_folder_that_is_no_reference(shell: Shell, run: Path, truth: Path, tmp_path: Path) -> None:

@@ -31,12 +31,13 @@ from scipy.spatial.transform import Rotation
 from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.errors import InputError
+from cleargs.evaluate import refinement
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_hash, write_report
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.references import Reference, align_cameras, reference_of, umeyama
-from cleargs.media.image import write_mask, write_rgb
+from cleargs.media.image import read_rgb, write_mask, write_rgb
 
 SAME = Similarity(np.eye(3), np.zeros(3), 1.0)
 
@@ -150,9 +151,9 @@ def test_equal_stems_of_other_views_are_noticed_and_helped(tmp_path: Path) -> No
     run = write_run(tmp_path / "run", scene, cameras(), poses="sfm")
     observed = write_reference(tmp_path / "observed", scene, cameras())
     folder = write_reference(tmp_path / "novel", scene, novel)
-    remarks = Remarks()
-    reference_of(run, folder, reporter=remarks)
-    assert "--align" in remarks.warnings[0]
+    with pytest.raises(InputError, match="too large") as caught:
+        reference_of(run, folder, reporter=Remarks())
+    assert "--align" in str(caught.value.hint)
     reference = reference_of(run, folder, align=observed, reporter=Remarks())
     assert psnr_of(measured(run / "g0" / "scene.ply", reference)) > NEARLY_EQUAL
 
@@ -333,6 +334,40 @@ def test_pose_refinement_recovers_a_planted_turn(tmp_path: Path) -> None:
         assert image.refinement.rotation_deg == pytest.approx(1.0, abs=0.05)
         assert image.refinement.loss_after < 1e-2 * image.refinement.loss_before
     assert psnr_of(refined) > 45
+
+
+def test_refined_poses_are_kept_only_where_they_are_better(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind the blur of the reduced image any pose may look better."""
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras(3))
+    folder = write_reference(tmp_path / "truth", scene, cameras(3))
+    reference = reference_of(run, folder, poses="given", reporter=Remarks())
+    monkeypatch.setattr(
+        refinement, "_descend", lambda comparison, pose, *_: turned(pose, 2.0) if comparison._blur else pose
+    )
+    plain = measured(run / "g0" / "scene.ply", reference)
+    options = PLAIN.model_copy(update={"refine_poses": 8})
+    refined = measured(run / "g0" / "scene.ply", reference, options)
+    for image in refined.images:
+        assert image.refinement is not None and image.refinement.rotation_deg == 0
+        assert image.refinement.loss_after == image.refinement.loss_before
+    assert psnr_of(refined) == psnr_of(plain)
+
+
+def test_psnr_with_aligned_colours_is_there_too(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras(3))
+    folder = write_reference(tmp_path / "truth", scene, cameras(3))
+    for path in (folder / "images").iterdir():
+        write_rgb(path, (0.7 * read_rgb(path)).astype(np.uint8))
+    found = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
+    aligned = found.psnr_colour_aligned
+    assert aligned is not None and aligned > psnr_of(found) + 10
+    options = PLAIN.model_copy(update={"align_colour": True})
+    again = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()), options)
+    assert again.psnr_colour_aligned is None and psnr_of(again) == pytest.approx(aligned)
 
 
 # -- the result --------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from cleargs.cli.main import invoke
 from cleargs.cli.synth import PROTOCOL_HELP
 from cleargs.errors import InputError
+from cleargs.media.image import read_rgb
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.progress import SilentReporter
 from cleargs.synth import raycast
@@ -214,3 +215,24 @@ def test_compiled_kernels_are_outside_the_package() -> None:
     """The package may be read-only, and should contain only installed files."""
     package = Path(raycast.__file__).parents[1]
     assert package not in Path(raycast._render.stats.cache_path).parents
+
+
+def test_camera_protocol_spoils_lens_focal_length_and_poses(captures: dict[str, Path]) -> None:
+    """Each frame is the sharp one through OpenCV's distortion; the given focal length is 6 % off."""
+    spoilt, sharp = captures["camera"], captures["sharp"]
+    given, exact = (
+        json.loads((folder / "transforms.json").read_text())
+        for folder in (spoilt, spoilt / "truth" / "observed")
+    )
+    assert given["fl_x"] == pytest.approx(1.06 * exact["fl_x"]) and "k1" not in given
+    assert not np.allclose(poses(spoilt), poses(spoilt / "truth" / "observed"))
+    matrix = np.array(
+        [[exact["fl_x"], 0, exact["cx"] - 0.5], [0, exact["fl_y"], exact["cy"] - 0.5], [0, 0, 1]]
+    )
+    distortion = np.array(PROTOCOLS["camera"].distortion)
+    for name in ("images/000000.png", "images/000005.png"):
+        bent = read_rgb(spoilt / name)
+        straight = cv2.undistort(bent, matrix, distortion).astype(float)[8:-8, 8:-8]
+        true = read_rgb(sharp / name).astype(float)
+        off, before = (np.abs(image - true[8:-8, 8:-8]).mean() for image in (straight, bent[8:-8, 8:-8]))
+        assert off < 0.6 * before

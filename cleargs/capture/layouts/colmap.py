@@ -1,38 +1,49 @@
-"""A COLMAP project: ``images/`` and a sparse model."""
+"""A COLMAP project: images and a sparse model."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import chosen, frame_key, image_files, is_inside, mask_externals
+from cleargs.capture.folders import (
+    chosen,
+    find_images,
+    folders_to_search,
+    frame_key,
+    image_files,
+    is_inside,
+    mask_externals,
+    require_most,
+)
 from cleargs.errors import InputError
+from cleargs.safe_io import FAULTS, open_regular, read_text
 
 
 def detect(source: Path, *, poses: bool) -> bool:
     """See `Layout.detect`."""
-    return poses and _find_model(source) is not None
+    return poses and bool(_models(source))
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """See `Layout.externals`."""
-    model = _find_model(source)
-    assert model is not None
-    return {"images": source / "images", **mask_externals(source), "sparse": model}
+    """See `Layout.externals`: the model, and all folders in which its images may be."""
+    images: dict[str, External] = {}
+    for folder in folders_to_search(source):
+        if folder == source:
+            images["beside_sparse"] = {path.name: path for path in image_files(source)}
+        else:
+            images[folder.name] = folder
+    return {**images, **mask_externals(source), "sparse": _largest(source)}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """See `Layout.open_capture`. Images without a pose are frames too: they stay in the table, marked."""
     from cleargs.capture.model import read_model
 
-    folder = _find_model(source)
-    assert folder is not None
+    models, folder = _models(source), _largest(source)
     model = read_model(folder)
-    root = source / "images"
-    if not root.is_dir():
-        raise InputError(f"{source} has a sparse model but no images/", hint="put the images into images/")
     posed = {image.name: image for image in model.images.values()}
     outside = [name for name in posed if not is_inside(name)]
     if outside:
@@ -40,25 +51,60 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
             f"the COLMAP model lists images outside images/ or hidden in it, such as {outside[0]}",
             hint="put them into images/ and export the model again, or set ingest.poses=sfm",
         )
-    missing = [name for name in posed if not (root / name).is_file()]
-    if missing:
-        raise InputError(
-            f"the COLMAP model lists images that do not exist, such as {missing[0]} ({len(missing)} in all)",
-            hint="put the images that the model was made from into images/, or set ingest.poses=sfm",
+    root, paths, by_stem = find_images(source, list(posed))
+    if not paths and not folders_to_search(source):
+        raise InputError(f"{source} has a sparse model but no images/", hint="put the images into images/")
+    notes = list(require_most([name for name in posed if name not in paths], len(posed), "the COLMAP model"))
+    if len(models) > 1:
+        notes.append(
+            f"{len(models)} sparse models: {folder.relative_to(source)} is read, which has the most images "
+            f"({len(posed)} images)"
         )
-    stored = {path.relative_to(root).as_posix() for path in image_files(root, below=True)}
+    if by_stem:
+        notes.append(f"the images of the COLMAP model are found in {root.name}/ by their stems")
+    known = set(paths.values())
+    stored = {
+        path.relative_to(root).as_posix(): path
+        for path in image_files(root, below=root != source)
+        if path not in known
+    }
     frames = []
-    for name in sorted(set(posed) | stored, key=frame_key):
+    for name, path in sorted({**stored, **paths}.items(), key=lambda item: frame_key(item[0])):
         image = posed.get(name)
         camera, pose = (None, None) if image is None else (model.cameras[image.camera_id], image.pose)
-        frames.append(SourceFrame(name, root / name, camera=camera, pose=pose))
+        frames.append(SourceFrame(name, path, camera=camera, pose=pose))
     taken = chosen(frames, source, config.max_frames)
-    return Capture("colmap", taken, len(frames), model if len(model.point_ids) or model.dropped else None)
+    sparse = model if len(model.point_ids) or model.dropped else None
+    return Capture("colmap", taken, len(frames), sparse, notes=tuple(notes))
 
 
-def _find_model(root: Path) -> Path | None:
-    """The folder of the sparse model, or None."""
-    for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0"):
-        if any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
-            return folder
-    return None
+def _models(root: Path) -> dict[Path, int]:
+    """Return the folders of sparse models with the number of images of each, ``sparse/0`` first."""
+    folders: list[Path] = []
+    for sparse in (root / "sparse", root / "colmap" / "sparse"):
+        if sparse.is_dir():
+            folders += [*sorted(path for path in sparse.iterdir() if path.name.isdecimal()), sparse]
+    found: dict[Path, int] = {}
+    for folder in folders:
+        for kind in ("bin", "txt"):
+            if (folder / f"images.{kind}").is_file():
+                found.setdefault(folder, _number_of_images(folder / f"images.{kind}"))
+    return found
+
+
+def _largest(root: Path) -> Path:
+    """Return the folder of the sparse model with the most images, the first of equals."""
+    models = _models(root)
+    return max(models, key=lambda folder: models[folder])
+
+
+def _number_of_images(file: Path) -> int:
+    """Return how many images a model's ``images.bin`` or ``images.txt`` states; 0 where it is damaged."""
+    try:
+        if file.suffix == ".bin":
+            with open_regular(file) as opened:
+                return int(struct.unpack("<Q", opened.read(8))[0])
+        lines = [line for line in read_text(file).splitlines() if not line.startswith("#")]
+        return sum(bool(line.strip()) for line in lines[::2])  # each has a second line, of its keypoints
+    except FAULTS:
+        return 0

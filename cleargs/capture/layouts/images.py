@@ -7,7 +7,15 @@ from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import chosen, frame_key, image_files, image_folders, mask_externals
+from cleargs.capture.folders import (
+    chosen,
+    folder_of_images,
+    folders_to_search,
+    frame_key,
+    image_files,
+    left_out,
+    mask_externals,
+)
 from cleargs.errors import InputError
 
 
@@ -24,19 +32,21 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """See `Layout.open_capture`; in the order of `frame_key`."""
-    files = sorted(image_files(_images_of(source)), key=lambda path: frame_key(path.name))
+    folder = _images_of(source)
+    files = sorted(image_files(folder), key=lambda path: frame_key(path.name))
     if not files:
         raise InputError(
             f"{source} holds no images, no video and no transforms.json",
             hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
         )
     frames = [SourceFrame(path.name, path) for path in files]
-    return Capture("images", chosen(frames, source, config.max_frames), len(frames))
+    notes = left_out(folder)
+    return Capture("images", chosen(frames, source, config.max_frames), len(frames), notes=notes)
 
 
 def _images_of(root: Path) -> Path:
-    """The first folder that holds any image of ``images/``, ``root`` itself, and the reductions, the largest
-    first; ``root`` where none does.
-    """
-    folders = [root / "images", root, *image_folders(root)]
-    return next((folder for folder in folders if folder.is_dir() and image_files(folder)), root)
+    """Return the folder with the images; a folder of any name where the usual ones have none."""
+    if (folder := folder_of_images(root)) is not None:
+        return folder
+    others = [folder for folder in folders_to_search(root) if image_files(folder)] if root.is_dir() else []
+    return max(others, key=lambda folder: len(image_files(folder)), default=root)

@@ -1,4 +1,4 @@
-"""poses_bounds.npy beside images, as LLFF writes it and NeRF, Deblur-NeRF and BAD-NeRF read it."""
+"""poses_bounds.npy next to images, as LLFF writes it and NeRF, Deblur-NeRF and BAD-NeRF read it."""
 
 from __future__ import annotations
 
@@ -38,20 +38,23 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """See `Layout.open_capture`; in the order of the rows, every N-th of which is a test view of these data
-    sets.
+    """See `Layout.open_capture`.
+
+    Frames have the order of the rows, because these data sets hold every N-th row out.
     """
     frames = read_llff(source)
     return Capture("llff", chosen(frames, source, config.max_frames), len(frames))
 
 
 def read_llff(root: Path) -> list[SourceFrame]:
-    """The images of ``root`` with their cameras, in the order of the rows.
+    """Return the images of ``root`` with their cameras, in the order of the rows.
 
-    Row i belongs to image i by sorted file name (not natural order), which is how LLFF writes the file and
-    how every reader of it counts its test views. The images are those of ``images/``, else of the largest
-    ``images_N/`` that has as many as there are rows: some releases keep test views in one of them only.
-    Raises InputError for a damaged file, a count that fits no folder, NaN and cameras that are none.
+    Row i belongs to image i by sorted file name (not natural order). LLFF writes the file so, and all its
+    readers count test views so. The images are those of ``images/``, else of the largest ``images_N/`` that
+    has as many images as there are rows, because some releases keep test views in only one folder.
+
+    Raises:
+        InputError: a damaged file, a number of rows that fits no folder, NaN, or cameras that no lens has.
     """
     table = read_poses_bounds(root / POSES_BOUNDS)
     folders = {
@@ -69,16 +72,19 @@ def read_llff(root: Path) -> list[SourceFrame]:
 
 
 def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
-    """The rows of ``path``: a 3x5 pose, then nearest and farthest depth. Pickled arrays are not loaded.
+    """Return the rows of ``path``: a 3x5 pose, then nearest and farthest depth.
 
-    Raises InputError when there is no such array in the file.
+    Pickled arrays are not loaded.
+
+    Raises:
+        InputError: the file contains no such array.
     """
     import numpy as np
 
     try:
         open_regular(path).close()
         # Mapped, so that a damaged header cannot ask for more memory than the file has bytes.
-        with warnings.catch_warnings(action="ignore"):  # that Python 2 wrote it is no news to anybody
+        with warnings.catch_warnings(action="ignore"):  # Python 2 wrote some
             table = np.lib.format.open_memmap(path, mode="r")
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
             raise ValueError(f"it holds {table.dtype} of shape {table.shape}, not numbers of shape (N, 17)")

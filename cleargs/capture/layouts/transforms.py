@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import chosen, frame_key, mask_externals, name_below_images
+from cleargs.capture.folders import (
+    chosen,
+    folders_to_search,
+    frame_key,
+    image_files,
+    mask_externals,
+    name_below_images,
+    require_most,
+)
 from cleargs.errors import InputError
-from cleargs.media import IMAGE_SUFFIXES
 from cleargs.safe_io import FAULTS, cause, read_json
 
 if TYPE_CHECKING:
@@ -26,57 +34,94 @@ class _Entry(NamedTuple):
 
     values: Mapping[str, Any]
     image: Path | None
-    """None where there is none."""
+    """None if the file does not exist."""
     mask: Path | None
-    """None where it names none, or there is none."""
+    """None if the entry names no mask, or the file does not exist."""
+
+
+_LISTING = "transforms.json"
+_SPLIT = tuple(f"transforms_{part}.json" for part in ("train", "test", "val"))
+"""Blender's form: a file per part. The frames of test, or without that file those of val, are held out."""
 
 
 def detect(source: Path, *, poses: bool) -> bool:
     """See `Layout.detect`: it lists images, with or without poses."""
-    return (source / "transforms.json").is_file()
+    return bool(_listings(source))
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """See `Layout.externals`. Raises InputError where the file cannot be read."""
-    file = source / "transforms.json"
-    _, entries = _read_listing(file)
-    images = {entry.values["file_path"]: entry.image for entry in entries}
-    masks = {entry.values.get("mask_path"): entry.mask for entry in entries}
-    found = {str(name): path for name, path in {**masks, **images}.items() if path is not None}
-    return {"transforms": file, "images": found, **mask_externals(source)}
+    """See `Layout.externals`.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    files = _listings(source)
+    found: dict[str, Path] = {}
+    for file in files:
+        _, entries = _read_listing(file)
+        images = {entry.values["file_path"]: entry.image for entry in entries}
+        masks = {entry.values.get("mask_path"): entry.mask for entry in entries}
+        found |= {str(name): path for name, path in {**masks, **images}.items() if path is not None}
+    return {**{file.stem: file for file in files}, "images": found, **mask_externals(source)}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """See `Layout.open_capture`."""
-    frames = read_transforms(source / "transforms.json", poses=config.poses == "auto")
+    files = _listings(source)
+    notes: list[str] = []
+    frames: list[SourceFrame] = []
+    for file in files:
+        test = file.name != _LISTING and file != files[0]
+        listed = read_transforms(file, poses=config.poses == "auto", notes=notes)
+        frames += [replace(frame, test=test) for frame in listed]
+    unread = [file.name for file in _split_files(source) if files[0].name != _LISTING and file not in files]
+    if unread:
+        notes.append(f"{', '.join(unread)} is not read: the test views are those of {files[-1].name}")
     frames.sort(key=lambda frame: frame_key(frame.name))
     names = [name_below_images(frame.name) for frame in frames]
-    return Capture("transforms", chosen(frames, source, config.max_frames, names), len(frames))
+    taken = chosen(frames, source, config.max_frames, names)
+    return Capture("transforms", taken, len(frames), notes=tuple(notes))
 
 
-def read_transforms(path: Path, *, poses: bool) -> list[SourceFrame]:
-    """The frames that ``path`` lists, in its order; without ``poses``, only their images.
+def _split_files(source: Path) -> list[Path]:
+    return [source / name for name in _SPLIT if (source / name).is_file()]
 
-    A frame's name is its ``file_path`` as listed, with the extension of the file found.
 
-    Further entries, such as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``,
-    are passed over.
+def _listings(source: Path) -> list[Path]:
+    """Return the files that list the frames of ``source``: transforms.json, or a split's first two."""
+    whole = source / _LISTING
+    return [whole] if whole.is_file() else _split_files(source)[:2]
 
-    Raises InputError for damaged JSON, missing images, missing or NaN poses, unknown cameras.
+
+def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) -> list[SourceFrame]:
+    """Return the frames that ``path`` lists, in its order; without ``poses``, only their images.
+
+    A frame's name is its ``file_path`` as listed, with the extension of the file found. Further entries, such
+    as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``, are passed over.
+
+    Args:
+        path: transforms.json, or a file of the same form.
+        poses: also read cameras and poses.
+        notes: list that receives a note on missing images, which are left out. None: they are an error.
+
+    Raises:
+        InputError: damaged JSON, most images missing, missing or NaN poses, unknown cameras.
     """
     common, entries = _read_listing(path)
     missing = [entry.values["file_path"] for entry in entries if entry.image is None]
-    if missing:
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+    if missing and notes is None:
         raise InputError(
-            f"{path.name} lists images that do not exist: {', '.join(missing[:3])}{more}",
+            f"{path.name} lists images that do not exist: {', '.join(missing[:3])}",
             hint="put the images where file_path says, or remove the entries",
         )
+    if notes is not None:
+        notes += require_most(missing, len(entries), path.name)
     frames = []
     for entry in entries:
-        assert entry.image is not None
+        if entry.image is None:
+            continue
         # The ending may be left out, dots in the name are none, and Windows has other slashes.
-        name = str(Path(entry.values["file_path"].replace("\\", "/")).with_name(entry.image.name))
+        name = Path(entry.values["file_path"].replace("\\", "/")).with_name(entry.image.name).as_posix()
         if entry.mask is None and "mask_path" in entry.values:
             raise InputError(
                 f"{name} names the mask {entry.values['mask_path']}, which does not exist",
@@ -89,7 +134,7 @@ def read_transforms(path: Path, *, poses: bool) -> list[SourceFrame]:
 
 
 def _camera(values: Mapping[str, Any], image: Path) -> Intrinsics:
-    """The camera of a frame: its own entries over those of the whole file."""
+    """Return the camera of a frame from its own values, else from those of the whole file."""
     from cleargs.capture.cameras import Intrinsics
 
     try:
@@ -139,7 +184,7 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
 
     from cleargs.capture.cameras import rigid_pose
 
-    hint = "remove the frame or correct its transform_matrix, or set ingest.poses=sfm to find the poses anew"
+    hint = "remove the frame or correct its transform_matrix, or set ingest.poses=sfm to find other poses"
     if "transform_matrix" not in entry:
         raise InputError(f"{name} has no pose (transform_matrix)", hint=hint)
     try:
@@ -152,9 +197,10 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
 
 
 def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
-    """All that stands next to ``frames`` in transforms.json, and the entries of ``frames``.
+    """Return the values next to ``frames`` in transforms.json, and the entries of ``frames``.
 
-    Raises InputError where it is damaged or an entry names no image.
+    Raises:
+        InputError: the file is damaged, or an entry names no image.
     """
     try:
         data = read_json(path)
@@ -164,13 +210,14 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
         if not isinstance(frames, list) or not all(isinstance(values, dict) for values in frames):
             raise ValueError("'frames' is not a list of objects")
         entries = []
+        files = _Files(path.parent)
         for number, values in enumerate(frames):
             if not isinstance(values.get("file_path"), str):
                 raise ValueError(f"frames[{number}] has no file_path")
             if not isinstance(values.get("mask_path", ""), str):
-                raise ValueError(f"frames[{number}] has a mask_path that is no text")
-            mask = _find(path.parent, values["mask_path"]) if "mask_path" in values else None
-            entries.append(_Entry(values, _find(path.parent, values["file_path"]), mask))
+                raise ValueError(f"frames[{number}] has a mask_path that is not text")
+            mask = files.find(values["mask_path"]) if "mask_path" in values else None
+            entries.append(_Entry(values, files.find(values["file_path"]), mask))
         return data, entries
     except FAULTS as error:
         raise InputError(
@@ -179,11 +226,30 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
         ) from error
 
 
-def _find(root: Path, listed: str) -> Path | None:
-    """The listed file; where it is listed without an extension, the image of that stem."""
-    path = root / listed.replace("\\", "/")
-    candidates = [path]
-    if path.name and path.suffix.lower() not in IMAGE_SUFFIXES:
-        endings = [ending for suffix in sorted(IMAGE_SUFFIXES) for ending in (suffix, suffix.upper())]
-        candidates += [path.with_name(path.name + ending) for ending in endings]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+class _Files:
+    """Finds the files that a listing names, also with another ending, case or folder."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._by_stem: dict[Path, dict[str, Path]] = {}
+        self._folders: list[Path] | None = None
+
+    def find(self, listed: str) -> Path | None:
+        """Return the listed file, else the image of its stem there, else that in another folder; or None."""
+        path = self._root / listed.replace("\\", "/")
+        if path.is_file():
+            return path
+        if (near := self._of_stem(path.parent, path.name)) is not None:
+            return near
+        if self._folders is None:
+            self._folders = folders_to_search(self._root)
+        found = (self._of_stem(folder, path.name) for folder in self._folders if not path.parent.is_dir())
+        return next((file for file in found if file is not None), None)
+
+    def _of_stem(self, folder: Path, name: str) -> Path | None:
+        if folder not in self._by_stem:
+            files = sorted(image_files(folder)) if folder.is_dir() else []
+            self._by_stem[folder] = {file.stem.lower(): file for file in reversed(files)}
+        stems = self._by_stem[folder]
+        # A listed name may have no ending, another ending, or lack a second one.
+        return stems.get(name.lower()) or stems.get(Path(name).stem.lower())

@@ -1,13 +1,15 @@
-"""A video: frames evenly in time."""
+"""Videos: frames evenly in time, of one or of all videos in a folder."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
+from cleargs.capture.folders import folder_of_images, videos_in
+from cleargs.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,38 +19,70 @@ if TYPE_CHECKING:
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `Layout.detect`: whatever is no folder."""
-    return not source.is_dir()
+    """See `Layout.detect`: a file, or a folder with videos and without images."""
+    return not source.is_dir() or (folder_of_images(source) is None and bool(videos_in(source)))
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
     """See `Layout.externals`."""
-    return {"capture": source}
+    videos = _videos(source)
+    if len(videos) == 1:
+        return {"capture": videos[0]}
+    return {"capture": {video.name: video for video in videos}}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """See `Layout.open_capture`."""
+    """See `Layout.open_capture`. Each video gets frames by its share of the time."""
     from cleargs.media.video import read_timeline
 
-    timeline = read_timeline(source)
-    chosen = choose_times(timeline, config.fps, config.max_frames)
-    frames = tuple(video_frame(source, timeline, index) for index in chosen)
-    return Capture("video", frames, len(timeline.pts), hdr=timeline.transfer)
+    videos = _videos(source)
+    whole = [read_timeline(video) for video in videos]
+    timelines = [timeline.between(config.start, config.end) for timeline in whole]
+    if not any(timeline.pts for timeline in timelines):
+        longest = max(timeline.seconds(-1) for timeline in whole)
+        raise InputError(
+            f"no frame of {source.name} is between ingest.start and ingest.end: it lasts {longest:.1f} s",
+            hint="give times in seconds from the first frame on, the start before the end",
+        )
+    frames: list[SourceFrame] = []
+    shares = _shares(timelines, config.max_frames)
+    for video, timeline, at_most in zip(videos, timelines, shares, strict=True):
+        if timeline.pts and at_most:
+            name = frame_prefix(video, videos)
+            chosen = choose_times(timeline, config.fps, at_most)
+            frames += [video_frame(video, timeline, index, name) for index in chosen]
+    hdr = next((timeline.transfer for timeline in whole if timeline.transfer), None)
+    available = sum(len(timeline.pts) for timeline in timelines)
+    return Capture(
+        "video",
+        tuple(frames),
+        available,
+        hdr=hdr,
+        stretch=(config.start, config.end),
+        notes=tuple(_notes(videos, whole)),
+    )
 
 
-def video_frame(source: Path, timeline: Timeline, index: int) -> SourceFrame:
-    """Frame ``index`` of a video."""
-    name = f"{source.stem}_{index:06d}"
+def frame_prefix(video: Path, videos: Sequence[Path]) -> str:
+    """Return the start of the names of its frames: its stem, or its name where another has that stem."""
+    return video.stem if sum(other.stem == video.stem for other in videos) == 1 else video.name
+
+
+def video_frame(source: Path, timeline: Timeline, index: int, prefix: str) -> SourceFrame:
+    """Return frame ``index`` of ``timeline``. Its number in its name counts from the start of the file."""
+    name = f"{prefix}_{len(timeline.before) + index:06d}"
     return SourceFrame(name, source, pts=timeline.pts[index], time_s=timeline.seconds(index))
 
 
 def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[int]:
-    """Frame numbers evenly in time (not in number: the frame rate may vary): every 1 / fps seconds if given,
-    and at most so many from first to last.
+    """Return frame numbers evenly in time (not in number: the frame rate may vary).
+
+    They are 1 / ``fps`` seconds apart if that is given, and at most ``at_most`` from first to last.
     """
     import numpy as np
 
     times = np.array([timeline.seconds(index) for index in range(len(timeline.pts))])
+    times -= times[0]
     span = float(times[-1])
     chosen = (
         list(range(len(times)))
@@ -56,6 +90,37 @@ def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[in
         else _nearest(times, np.arange(int(span * fps + 1e-6) + 1) / fps)
     )
     return chosen if len(chosen) <= at_most else _nearest(times, np.linspace(0, span, at_most))
+
+
+def _videos(source: Path) -> list[Path]:
+    return videos_in(source) if source.is_dir() else [source]
+
+
+def _shares(timelines: Sequence[Timeline], at_most: int) -> list[int]:
+    """Share ``at_most`` frames out by the length of each video, by largest remainders."""
+    spans = [timeline.seconds(-1) - timeline.seconds(0) if timeline.pts else 0.0 for timeline in timelines]
+    total = sum(spans)
+    if len(spans) == 1 or total == 0:
+        return [at_most] * len(spans)
+    wanted = [at_most * span / total for span in spans]
+    shares = [int(share) for share in wanted]
+    order = sorted(range(len(wanted)), key=lambda number: shares[number] - wanted[number])
+    for number in order[: at_most - sum(shares)]:
+        shares[number] += 1
+    return shares
+
+
+def _notes(videos: Sequence[Path], timelines: Sequence[Timeline]) -> list[str]:
+    notes = []
+    for video, timeline in zip(videos, timelines, strict=True):
+        if timeline.others:
+            notes.append(
+                f"{video.name} holds {timeline.others + 1} videos: the one with the most pixels is read; "
+                "to read another, copy it into a file without the others (ffmpeg -map)"
+            )
+        if timeline.interlaced:
+            notes.append(f"{video.name} is interlaced: each frame is made from its first field (bwdif)")
+    return notes
 
 
 def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[int]:

@@ -1,0 +1,196 @@
+"""Adjustment of poses, points and cameras to the features, judged by matches that take no part in it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.capture.colmap import pycolmap
+from cleargs.capture.judging import CAPPED_PX, epipolar_errors, keep_out
+from cleargs.capture.matching import copy_without_features
+
+FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
+"""Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
+terms."""
+
+SHARED_BY = 8
+"""Fewest frames per camera from which cameras of the input are adjusted with its poses."""
+
+_ROUNDS = 4
+_TOLERANCE = 1e-5
+"""Relative change of the cost at which an adjustment ends. COLMAP's 0 takes three times as long for the same
+poses."""
+
+_LENS_GAIN = 0.02
+"""`FULL_LENS` is taken where it lowers the mean error of the matches that were kept out by at least this
+share. Lenses that one radial term describes gain 0.000 to 0.010, that of a wide camera 0.073."""
+
+_HELD_BY = 15
+"""Fewest points that a frame must see to take part in an adjustment."""
+
+_UNPLACED_PX = 1e4
+"""Stands for the error of a match of a frame without a pose."""
+
+
+class Adjuster:
+    """Adjusts models to the matches in a database but every tenth track, and measures errors on these."""
+
+    def __init__(
+        self, database: Path, triangulate: Callable[[pycolmap.Reconstruction, Path], pycolmap.Reconstruction]
+    ) -> None:
+        """Copy ``database`` without the tracks that are kept out.
+
+        Args:
+            database: features and verified matches; it stays as it is.
+            triangulate: gives a model new points, from the matches in a database.
+
+        ``floor`` is the `median_error` if each pair of frames has a separate geometry.
+        """
+        self._cut = database.with_name(f"{database.stem}-cut.db")
+        copy_without_features(database, self._cut, [])
+        self._kept_out, self.floor = keep_out(self._cut)
+        self._triangulate = triangulate
+
+    def errors(self, model: pycolmap.Reconstruction) -> NDArray[np.float64]:
+        """Return how far the matches that are kept out are from their epipolar lines, px of the images."""
+        images = [image for image in model.images.values() if image.has_pose]
+        found = epipolar_errors(
+            self._kept_out,
+            {image.image_id: image.cam_from_world().matrix() for image in images},
+            {image.image_id: model.cameras[image.camera_id] for image in images},
+        )
+        return np.asarray(np.minimum(found, _UNPLACED_PX))
+
+    def median_error(self, model: pycolmap.Reconstruction) -> float:
+        """Return the median of `errors`; 0 where no match was kept out."""
+        errors = self.errors(model)
+        return float(np.median(errors)) if len(errors) else 0.0
+
+    def refine(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction | None:
+        """Return ``model`` with poses, points and, with ``cameras``, lenses adjusted.
+
+        None where few points hold every frame.
+        """
+        refined = copy.deepcopy(model)
+        if cameras and _has_first_lens(refined):
+            set_lens(refined, FIRST_LENS)
+        # At better poses more features find their points, so both are done in turn.
+        for _ in range(_ROUNDS):
+            refined = self._adjusted(refined, cameras=cameras)
+        if cameras and lens_of(refined) == FIRST_LENS:
+            refined = self._with_measured_lens(refined)
+        held = _held(refined)
+        return _anchored(refined, model, held) if held else None
+
+    def adjust(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
+        """Return a model that all matches made, adjusted without those that are kept out."""
+        adjusted = self._adjusted(self._triangulate(copy.deepcopy(model), self._cut), cameras=cameras)
+        return _anchored(adjusted, model, _held(adjusted) or list(adjusted.images.values()))
+
+    def with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Return ``model``, with `FULL_LENS` where it explains the matches that are kept out better."""
+        if lens_of(model) != FIRST_LENS:
+            return model
+        start = self.adjust(model, cameras=True)
+        best = self._with_measured_lens(start)
+        return model if best is start else _anchored(best, model, _held(best))
+
+    def _with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        full = copy.deepcopy(model)
+        set_lens(full, FULL_LENS)
+        full = self._adjusted(full, cameras=True)
+        before, after = (np.minimum(self.errors(each), CAPPED_PX).sum() for each in (model, full))
+        return full if after < (1 - _LENS_GAIN) * before and _held(full) else model
+
+    def _adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
+        options = pycolmap.BundleAdjustmentOptions(
+            refine_focal_length=cameras, refine_extra_params=cameras, print_summary=False
+        )
+        # Wrong matches are still among them.
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.solver_options.num_threads = 1
+        options.ceres.solver_options.function_tolerance = _TOLERANCE
+        pycolmap.bundle_adjustment(model, options)
+        return self._triangulate(model, self._cut)
+
+
+def lens_of(model: pycolmap.Reconstruction) -> str:
+    """Return the names of the camera models of ``model``, separated by commas."""
+    return ", ".join(sorted({camera.model.name for camera in model.cameras.values()}))
+
+
+def set_lens(model: pycolmap.Reconstruction, lens: str) -> None:
+    """Make all cameras of ``model`` cameras of ``lens``; focal length, centre and first radial term stay."""
+    for camera in model.cameras.values():
+        focal = camera.mean_focal_length()
+        radial = float(camera.params[3]) if camera.model.name == FIRST_LENS else 0.0
+        centre = [camera.principal_point_x, camera.principal_point_y]
+        camera.model = getattr(pycolmap.CameraModelId, lens)
+        more = [radial] if lens == FIRST_LENS else [radial, 0.0, 0.0, 0.0]
+        camera.params = [*([focal] if lens == FIRST_LENS else [focal, focal]), *centre, *more]
+
+
+def _has_first_lens(model: pycolmap.Reconstruction) -> bool:
+    """Return True if `FIRST_LENS` has all distortion that the cameras of ``model`` have."""
+    simple = ("SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS)
+    return all(camera.model.name in simple for camera in model.cameras.values())
+
+
+def median_residual(model: pycolmap.Reconstruction) -> float:
+    """Return the median over the points of their mean reprojection error, px; 0 without any point."""
+    errors = [point.error for point in model.points3D.values()]
+    return float(np.median(errors)) if errors else 0.0
+
+
+def lay_over(
+    model: pycolmap.Reconstruction, given: pycolmap.Reconstruction, held: Collection[pycolmap.Image]
+) -> None:
+    """Lay ``model`` over the cameras of ``given`` by the similarity that fits its images ``held`` best.
+
+    The size follows from how far the centres spread. The turn follows from centres and axes together, as the
+    centres of a straight path leave the turn about it open (Kabsch 1976).
+    """
+    before = {image.name: image for image in given.images.values() if image.has_pose}
+    found, known = [_camera(image) for image in held], [_camera(before[image.name]) for image in held]
+    ours, theirs = (np.stack([centre for centre, _ in cameras]) for cameras in (found, known))
+    ours_mean, theirs_mean = ours.mean(axis=0), theirs.mean(axis=0)
+    a, b = ours - ours_mean, theirs - theirs_mean
+    spread = float(np.linalg.norm(a))
+    scale = float(np.linalg.norm(b)) / spread if spread > 0 else 1.0
+    product = scale * a.T @ b + sum(
+        mine.T @ other for (_, mine), (_, other) in zip(found, known, strict=True)
+    )
+    u, _, vt = np.linalg.svd(product)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = (u @ mirror @ vt).T
+    shift = theirs_mean - scale * turn @ ours_mean
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), shift))
+
+
+def _held(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [image for image in model.images.values() if image.has_pose and image.num_points3D >= _HELD_BY]
+
+
+def _anchored(
+    model: pycolmap.Reconstruction, given: pycolmap.Reconstruction, held: Collection[pycolmap.Image]
+) -> pycolmap.Reconstruction:
+    """Lay ``model`` over ``given``, which has the same frames; frames that few points hold get its poses.
+
+    The features leave place, turn and size of the whole open.
+    """
+    lay_over(model, given, held)
+    names = {image.name for image in held}
+    poses = {image.name: image.cam_from_world() for image in given.images.values() if image.has_pose}
+    for image in model.images.values():
+        if image.has_pose and image.name not in names:
+            model.frames[image.frame_id].rig_from_world = pycolmap.Rigid3d(poses[image.name].matrix())
+    return model
+
+
+def _camera(image: pycolmap.Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where a camera is, [3], and its axes in the world, one per row, [3, 3]."""
+    return np.asarray(image.projection_center()), np.asarray(image.cam_from_world().rotation.matrix())

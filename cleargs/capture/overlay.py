@@ -1,0 +1,85 @@
+"""Parts of the pictures that do not belong to the scene: text burnt in, and pictures of all directions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.media.image import read_rgb
+
+_SAMPLES = 32
+"""Pictures that are compared, evenly over the capture."""
+
+_FEWEST = 6
+"""Fewest images. In fewer, equal pixels by chance are not rare enough."""
+
+_STILL = 4.0
+"""Standard deviation over the pictures, levels, up to which a pixel is still. JPEG and H.264 leave 1 to 3."""
+
+_MOVES = 10.0
+"""Median standard deviation over a picture from which the camera moves."""
+
+_EDGE = 40.0
+"""Sobel response of the mean picture, levels per pixel times 4, from which a pixel has structure."""
+
+_SHARE = 0.002, 0.5
+"""Least and largest share of still structure. Above, the camera stands; below, it is a chance."""
+
+
+def still_parts(images: Sequence[Path]) -> NDArray[np.uint8] | None:
+    """Return a mask of what is at the same pixels in all ``images`` of a moving camera (0 there, else 255).
+
+    Still pixels count where they have structure that differs from their surroundings, as letters, logos and
+    bars have: a clipped sky is still too, but belongs to the scene. None where there are none, and where the
+    images are of several sizes.
+    """
+    step = max(1, len(images) / _SAMPLES)
+    chosen = [images[int(index * step)] for index in range(min(len(images), _SAMPLES))]
+    if len(chosen) < _FEWEST:
+        return None
+    total: NDArray[np.float32] | None = None
+    squares: NDArray[np.float32] | None = None
+    for path in chosen:
+        grey = cv2.cvtColor(read_rgb(path), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        if total is None or squares is None:
+            total, squares = np.zeros_like(grey), np.zeros_like(grey)
+        if grey.shape != total.shape:
+            return None
+        total += grey
+        squares += grey * grey
+    assert total is not None and squares is not None
+    mean = total / len(chosen)
+    deviation = np.sqrt(np.maximum(squares / len(chosen) - mean * mean, 0))
+    if np.median(deviation) < _MOVES:
+        return None
+    slope = np.hypot(cv2.Sobel(mean, cv2.CV_32F, 1, 0), cv2.Sobel(mean, cv2.CV_32F, 0, 1))
+    still = np.asarray(cv2.dilate((deviation <= _STILL).astype(np.uint8), np.ones((3, 3), np.uint8)))
+    # A letter is the still pixels near its edges.
+    edges = np.where(slope >= _EDGE, still, 0).astype(np.uint8)
+    found = np.minimum(cv2.dilate(edges, np.ones((3, 3), np.uint8)), still)
+    found = np.asarray(cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)))
+    reach = max(3, round(0.01 * max(mean.shape)) | 1)
+    if not _SHARE[0] <= float(found.mean()) <= _SHARE[1]:
+        return None
+    grown = cv2.dilate(found, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    return np.asarray(np.where(grown > 0, 0, 255), np.uint8)
+
+
+def wraps_around(rgb: NDArray[np.uint8]) -> bool:  # [H, W, 3]
+    """Return True if a picture twice as wide as high continues from its right edge to its left one.
+
+    An equirectangular picture shows all directions, so that its edges are neighbours.
+    """
+    height, width = rgb.shape[:2]
+    if abs(width - 2 * height) > 2:
+        return False
+    columns = rgb.astype(np.float32)
+    across = float(np.abs(columns[:, 0] - columns[:, -1]).mean())
+    beside = float(np.abs(np.diff(columns, axis=1)).mean())
+    # Half a picture apart, columns are as different as chance has it.
+    apart = float(np.abs(columns[:, 0] - columns[:, width // 2]).mean())
+    return across <= 3 * beside and across < 0.5 * apart

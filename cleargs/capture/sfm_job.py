@@ -1,0 +1,60 @@
+"""Job of COLMAP's process, and its outcome: what `cleargs.capture.sfm` and its child process exchange."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from cleargs.base_model import FrozenModel
+from cleargs.capture.cameras import Intrinsics
+from cleargs.capture.config import SfmConfig
+
+OWN = "own"
+"""Convention of an input's poses: the one of its layout."""
+
+OUTCOME = "outcome.json"
+"""In the folder of the model: its `SfmOutcome`."""
+
+
+class Job(FrozenModel):
+    """Input of COLMAP: working images, their cameras, the poses if they are known, and settings."""
+
+    folder: Path
+    images: Path
+    masks: Path | None
+    names: list[str]
+    cameras: list[Intrinsics]
+    camera_of: list[int]
+    """Number of the camera of each image."""
+    poses: dict[str, list[list[list[float]]]] | None
+    """Convention that the input may mean -> matrices 3x4, world to camera, of all images."""
+    exif_images: list[Path | None]
+    """Input image of each camera that may state its focal length."""
+    config: SfmConfig
+    seed: int
+    threads: int
+
+
+class SfmOutcome(FrozenModel):
+    """Origin of a model."""
+
+    placed: Mapping[str, str] = Field(default_factory=dict)
+    """Working image -> method by which its pose was found, or reason why there is none."""
+    missed_px: float | None = None
+    """Median reprojection error at the input's poses, px of the working images; None: it has no poses."""
+    convention: str = OWN
+    """The convention by which the input's poses fit the images."""
+    method: Literal["given", "adjusted", "sfm"] = "given"
+    """Origin of the poses: the input's, the input's after adjustment, or structure from motion."""
+    errors_px: Mapping[str, float] = Field(default_factory=dict)
+    """Method -> median distance from their epipolar lines of matches that were kept out, px."""
+    lens: str = ""
+    """COLMAP model of the cameras that were adjusted; empty: no camera was."""
+
+    @property
+    def refined(self) -> bool:
+        """Return True if the poses are not those of the input."""
+        return self.method != "given"

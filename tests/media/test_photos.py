@@ -1,0 +1,135 @@
+"""Photographs as phones write them: HEIC, AVIF and JPEG XL files, and colours beyond sRGB."""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO
+import pytest
+from numpy.typing import NDArray
+from PIL import Image, ImageCms
+
+from cleargs.errors import InputError
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.media.image import image_size, read_alpha, read_rgb
+
+P3_FROM_SRGB = np.array([[0.8225, 0.1774, 0.0], [0.0332, 0.9669, 0.0], [0.0171, 0.0724, 0.9108]])
+"""Linear light, both with the white point D65."""
+
+COLOURS = np.array([[200, 60, 40], [40, 180, 70], [60, 80, 210], [128, 128, 128]], np.uint8)
+
+
+def stripes() -> NDArray[np.uint8]:
+    """Broad stripes [40, 64, 3], darker in the upper half."""
+    picture = np.repeat(np.repeat(COLOURS[None], 40, 0), 16, 1)
+    picture[:20] //= 2
+    return picture
+
+
+def display_p3() -> bytes:
+    """An ICC profile of Display P3, made of that of sRGB with other primaries."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    primaries = {b"rXYZ": (0.51512, 0.2412, -0.00105), b"gXYZ": (0.29198, 0.69225, 0.04189)}
+    primaries[b"bXYZ"] = (0.1571, 0.06657, 0.78407)
+    for entry in range(struct.unpack_from(">I", profile, 128)[0]):
+        name, offset, size = struct.unpack_from(">4sII", profile, 132 + 12 * entry)
+        if name in primaries:
+            struct.pack_into(">3i", profile, offset + 8, *(round(65536 * x) for x in primaries[name]))
+        if name == b"desc":
+            profile[offset + 8 : offset + size] = bytes(size - 8)
+    return bytes(profile)
+
+
+def as_p3(srgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    light = linear_from_srgb(srgb / 255.0) @ P3_FROM_SRGB.T
+    return np.rint(255 * srgb_from_linear(light)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif"])
+def test_display_p3_becomes_srgb(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    image = Image.fromarray(as_p3(stripes()))
+    image.save(path, icc_profile=display_p3(), quality=100, lossless=True)
+    off = np.abs(read_rgb(path).astype(int) - stripes())[8:12, 8::16]  # away from where chroma is mixed
+    assert off.max() <= 4
+    assert np.abs(as_p3(stripes()).astype(int) - stripes()).max() > 12
+
+
+def test_an_srgb_profile_changes_nothing(tmp_path: Path) -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(stripes()).save(tmp_path / "a.png", icc_profile=profile)
+    assert np.array_equal(read_rgb(tmp_path / "a.png"), stripes())
+
+
+@pytest.mark.parametrize("profile", [b"", b"no profile at all", display_p3()[:200]])
+def test_a_damaged_profile_is_passed_over(tmp_path: Path, profile: bytes) -> None:
+    Image.fromarray(stripes()).save(tmp_path / "a.png", icc_profile=profile)
+    assert np.array_equal(read_rgb(tmp_path / "a.png"), stripes())
+
+
+def photo(path: Path, *, turned: bool = False) -> Path:
+    """A photograph in the format of the suffix, quality 95; ``turned``: a quarter, by EXIF."""
+    exif = Image.Exif()
+    exif[274] = 6 if turned else 1
+    Image.fromarray(np.rot90(stripes()) if turned else stripes()).save(path, quality=95, exif=exif)
+    return path
+
+
+def test_avif(tmp_path: Path) -> None:
+    path = photo(tmp_path / "a.avif")
+    assert image_size(path) == (64, 40) and read_alpha(path) is None
+    assert np.abs(read_rgb(path).astype(int) - stripes())[5:15, 4::16].max() < 12
+    turned = photo(tmp_path / "b.avif", turned=True)
+    assert read_rgb(turned).shape == (40, 64, 3) and read_rgb(turned, upright=False).shape == (64, 40, 3)
+
+
+def test_transparent_avif(tmp_path: Path) -> None:
+    picture = np.dstack([stripes(), np.full((40, 64), 255, np.uint8)])
+    picture[:, :32, 3] = 0
+    Image.fromarray(picture).save(tmp_path / "a.avif", quality=95)
+    alpha = read_alpha(tmp_path / "a.avif")
+    assert alpha is not None and not alpha[:, :30].any() and alpha[:, 34:].all()
+
+
+def test_jpeg_xl(tmp_path: Path) -> None:
+    assert OpenImageIO.ImageBuf(stripes()).write(str(tmp_path / "a.jxl"))
+    assert image_size(tmp_path / "a.jxl") == (64, 40)
+    assert np.abs(read_rgb(tmp_path / "a.jxl").astype(int) - stripes())[5:15, 4::16].max() < 12
+
+
+def test_heic(tmp_path: Path) -> None:
+    pytest.importorskip(
+        "pillow_heif", reason="the extra cleargs[heif] is not installed"
+    ).register_heif_opener()
+    path = photo(tmp_path / "a.HEIC")
+    assert image_size(path) == (64, 40)
+    assert np.abs(read_rgb(path).astype(int) - stripes())[5:15, 4::16].max() < 12
+    path.rename(tmp_path / "named-otherwise.jpg")  # as some phones and services hand them out
+    assert image_size(tmp_path / "named-otherwise.jpg") == (64, 40)
+
+
+def test_heic_without_its_package_names_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(12))
+    with pytest.raises(InputError, match="pillow-heif") as caught:
+        read_rgb(tmp_path / "a.heic")
+    assert "cleargs[heif]" in str(caught.value.hint)
+
+
+@pytest.mark.parametrize("brand", [b"heic", b"avif"])
+def test_a_damaged_photo(tmp_path: Path, brand: bytes) -> None:
+    if brand == b"heic" and importlib.util.find_spec("pillow_heif") is None:
+        pytest.skip("the extra cleargs[heif] is not installed")
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftyp" + brand + bytes(100))
+    with pytest.raises(InputError, match="not an image that can be read"):
+        read_rgb(tmp_path / "a.heic")
+
+
+def test_half_a_photo(tmp_path: Path) -> None:
+    path = photo(tmp_path / "a.avif")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match="not an image that can be read"):
+        read_rgb(path)
