@@ -52,7 +52,7 @@ class Reporter(Protocol):
 
 
 COMPILING = "compiling kernels, once on this machine"
-"""Label of a task that a machine does once: its seconds are no part of a stage's."""
+"""Label of a task that a machine does once. Its seconds do not count as a stage's."""
 
 
 class Rate:

@@ -251,7 +251,7 @@ def test_a_folder_without_a_model_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_draft_limits_the_capture_and_trains_g0_to_its_end() -> None:
-    """What the user has set is kept for a later run of another quality."""
+    """The user's settings are kept for a later run of another quality."""
     config = load_config(installed(), overrides=["g0.quality=draft", "ingest.max_frames=200"])
     asked: Any = config.sections
     used: Any = config.effective

@@ -180,7 +180,7 @@ class Trainer:
         return Trained(self.scene.to("cpu"), self.rows(round), state)
 
     def _warm_up(self, reporter: Reporter) -> None:
-        """Compile the kernels before the first step, in a task of its own where it takes its time."""
+        """Compile the kernels before the first step, as a separate task if that takes long."""
         compiled = compiled_mark(self._device.type)
         if compiled.exists():
             self._backend.warm_up()

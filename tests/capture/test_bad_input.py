@@ -118,7 +118,10 @@ def test_damaged_colmap_model(posed: Path, ingest: Ingest) -> None:
             open_capture(project, IngestConfig())
         assert refused(caught)
         path.write_bytes(data)
-    for offset, number in ((12, float("nan")), (44, 1e300)):  # of the first quaternion and translation
+    for offset, number in (
+        (12, float("nan")),
+        (44, 1e300),
+    ):  # offsets in the first quaternion and translation
         images = bytearray(whole[sparse / "images.bin"])
         struct.pack_into("<d", images, offset, number)
         (sparse / "images.bin").write_bytes(images)
@@ -216,7 +219,7 @@ def test_points_that_are_not_finite_are_left_out(posed: Path, ingest: Ingest) ->
     project = ingest(posed, "first").out
     model = project / "colmap" / "sparse" / "0"
     points = bytearray((model / "points3D.bin").read_bytes())
-    for value in (float("nan"), 1e300):  # of the first point: x, then y
+    for value in (float("nan"), 1e300):  # for x of the first point, then y
         struct.pack_into("<d", points, 16, value)
         (model / "points3D.bin").write_bytes(points)
         again = ingest(project, f"again {value}")

@@ -64,7 +64,7 @@ def test_prints_do_not_disturb_the_reports(module: Path) -> None:
 
 
 def gone(pid: int) -> bool:
-    """Whether the process ends within ten seconds (a zombie that nobody waits for counts as ended)."""
+    """Return True if the process ends within ten seconds (a zombie that nobody waits for counts as ended)."""
     for _ in range(200):
         try:
             state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]

@@ -81,7 +81,7 @@ def test_llff_poses_are_those_planted(tmp_path: Path, scale: float) -> None:
         assert frame.camera is not None
         camera = frame.camera.resized(WIDTH, HEIGHT)
         assert (camera.model, camera.params) == ("PINHOLE", (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
-    # hold=7 beside the images: every seventh image is a sharp test view.
+    # hold=7 next to the images: every seventh image is a sharp test view.
     (tmp_path / "hold=7").touch()
     assert held_out_names(capture, "every:7") == ["000.png", "007.png"]
     roles = {"poses_bounds": "poses_bounds.npy", "images": "images", "images_4": "images_4"}
@@ -227,7 +227,7 @@ def test_llff_capture_is_ingested(tmp_path: Path, frames: Frames, ingest: Ingest
     done = ingest(source, holdout="every:4")
     summary = done.result.summary
     assert summary["kind"] == "llff" and summary["poses"] == "input"
-    # True poses triangulate to well below a pixel; axes taken for others would leave next to no points.
+    # True poses triangulate to well below a pixel; wrong axes would leave almost no points.
     assert summary["registered"] == 10 and summary["points"] > 200
     assert summary["mean_reprojection_error_px"] < 1
     rows = load_frames(done.out)

@@ -1,4 +1,4 @@
-"""What a run is expected to cost, before anything of it exists."""
+"""Expected cost of a run before anything of it exists."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_size_and_number_of_frames_come_from_the_files(photos: Path) -> None:
     assert plain["ingest"].frames == 20 and plain["ingest"].megapixels == 0.48
     small = costs(photos, "ingest.max_size=400")
     assert small["ingest"].megapixels == 0.12
-    # Of the trainings a share stays that each step costs, whatever its pixels.
+    # A part of each step's cost does not depend on the number of pixels.
     assert 0.2 < small["rivr"].minutes / plain["rivr"].minutes < 0.3
     assert small["rivr"].disk_gb == pytest.approx(plain["rivr"].disk_gb / 4)
     assert small["g0"].minutes < plain["g0"].minutes

@@ -159,7 +159,7 @@ def test_poses_that_the_images_contradict_are_adjusted(shaken: Path, ingest: Ing
 
 
 def test_what_a_rolling_shutter_does_is_not_put_down_to_the_poses(posed: Path, ingest: Ingest) -> None:
-    """The rows of each image swing to and fro, as under a camera that shakes while they are read."""
+    """The rows of each image swing back and forth, as under a camera that shakes while they are read."""
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
     for index, path in enumerate(sorted((posed / "images").iterdir())):
         swing = 4 * np.sin(4 * np.pi * rows / HEIGHT + index)
@@ -220,7 +220,7 @@ def test_sfm_finds_the_arc(images: Path, ingest: Ingest) -> None:
     frames = load_frames(done.out)
     assert [frame.name for frame in frames] == [f"view{index}.png" for index in range(10)]
     assert done.result.summary["poses"] == "sfm" and all(frame.registered for frame in frames)
-    assert errors_of_poses(done.out)[1] < 0.05  # of an arc 2.4 long
+    assert errors_of_poses(done.out)[1] < 0.05  # the arc is 2.4 long
 
     again = ingest(images, "again", threads=1)
     assert same_bytes(done.out, again.out)
@@ -356,7 +356,7 @@ def test_few_registered_frames_fail_or_warn(images: Path, ingest: Ingest) -> Non
     assert [frame.registered for frame in load_frames(done.out)] == [True] * 10 + [False] * 8
     assert [frame.placed for frame in load_frames(done.out)] == ["sfm"] * 10 + ["no features"] * 8
     assert len(done.warnings) == 1 and "10 of 18" in done.warnings[0]
-    (images.parent / "strict.work").symlink_to(images.parent / "out.work")  # the same work, judged anew
+    (images.parent / "strict.work").symlink_to(images.parent / "out.work")  # the same work, judged again
     with pytest.raises(StageError, match="only 10 of 18") as caught:
         ingest(images, "strict", min_registered=0.9)
     assert "ingest.camera_model" in caught.value.hint
@@ -380,7 +380,7 @@ def test_blurred_frames_are_placed_at_half_resolution(images: Path, ingest: Inge
     second = "sfm at half resolution"
     assert words == [second if index in (4, 7) else "sfm" for index in range(10)]
     assert done.result.summary["placed"] == {"sfm": 8, "sfm at half resolution": 2}
-    # Of an arc 2.4 long. The blur covers 25 px, 0.3 at the depth of the planes; what is left of it is 0.06.
+    # The arc is 2.4 long. The blur covers 25 px, 0.3 at the depth of the planes; what is left of it is 0.06.
     assert errors_of_poses(done.out)[1] < 0.1
     assert same_bytes(done.out, ingest(images, "again", threads=2).out)
 
@@ -412,7 +412,7 @@ def test_matrices_of_another_convention(posed: Path, ingest: Ingest, meant: obje
 @pytest.mark.parametrize("focal", [250.0, 360.0])
 def test_a_wrong_focal_length_is_adjusted(posed: Path, ingest: Ingest, focal: float) -> None:
     write_transforms(posed, camera_to_world(10), fl_x=focal, fl_y=focal)
-    done = ingest(posed, refine_above=0.3)  # of images 320 px wide
+    done = ingest(posed, refine_above=0.3)  # px, in images 320 px wide
     assert done.result.summary["poses"] in ("refined", "sfm") and done.result.summary["lens"]
     assert all(abs(frame.fx / FOCAL - 1) < 0.02 for frame in load_frames(done.out))
     assert errors_of_poses(done.out) < (0.3, 0.05)

@@ -21,7 +21,7 @@ from .conftest import Ingest
 
 
 def moved(posed: Path, place: str, listed: str, key: str = '"file_path"') -> Path:
-    """transforms.json lists its first image as ``listed``, and that lies at ``place``; returns that file."""
+    """Move the first image to ``place``, list it as ``listed`` in transforms.json, and return its path."""
     file = posed / place
     file.parent.mkdir(parents=True, exist_ok=True)
     shutil.move(posed / "images" / "000.png", file)
@@ -70,7 +70,7 @@ def test_a_listed_mask_counts_wherever_it_lies(posed: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", ["../other/000.png", ".hidden/000.png", "/000.png"])
 def test_a_colmap_model_lists_no_image_outside_its_folder(posed: Path, ingest: Ingest, name: str) -> None:
-    """What is outside images/ is in no digest: a change there would be missed."""
+    """No digest covers files outside images/: a change there would be missed."""
     project = ingest(posed).out
     model = project / "colmap" / "sparse" / "0" / "images.bin"
     model.write_bytes(model.read_bytes().replace(b"000000.png\0", name.encode() + b"\0"))

@@ -1,4 +1,4 @@
-"""What a killed ingest left may be damaged: thrown away with a warning, the results are the same."""
+"""Damaged files of a killed ingest: they are removed with a warning, and the results are the same."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def digests(out: Path) -> dict[str, str]:
 
 @pytest.fixture
 def settings() -> dict[str, int]:
-    """Small images: COLMAP may start anew for a damage."""
+    """Small images: COLMAP may start again after a damage."""
     return {"feature_size": 160, "max_size": 160, "max_features": 256}
 
 

@@ -90,7 +90,7 @@ def test_a_process_that_dies_is_told(database: Path, monkeypatch: pytest.MonkeyP
 def test_matches_that_cannot_be_gathered_are_not_passed_over(
     database: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A full disk, say: SfM with a part of the matches would be taken for done."""
+    """For example a full disk: SfM with a part of the matches would be mistaken for complete."""
     monkeypatch.setattr(matching, "_match_block", spoil)
     with pytest.raises(sqlite3.DatabaseError):
         match(database, 1)

@@ -172,7 +172,7 @@ def test_a_count_that_no_file_holds(tmp_path: Path, name: str, offset: int) -> N
 @pytest.mark.parametrize("name", ["rigs", "frames"])
 @pytest.mark.parametrize("damage", [b"", b"\xff\x07" * 700])
 def test_damaged_rigs_are_not_read(tmp_path: Path, name: str, damage: bytes) -> None:
-    """pycolmap would read on past the end of the file; in a process of its own, so that it may not end."""
+    """pycolmap would read on past the end of the file; so it runs in a separate process."""
     write_model(tmp_path, small_model(), np.zeros((4, 3), np.uint8))
     pycolmap.Reconstruction(str(tmp_path)).write_binary(tmp_path)
     (tmp_path / f"{name}.bin").write_bytes(damage)
@@ -264,7 +264,7 @@ def test_unknown_holdout_is_refused(rule: str) -> None:
 
 
 def test_frames_are_chosen_in_time() -> None:
-    # Ten frames in the first second, then one a second.
+    # Ten frames in the first second, then one per second.
     pts = (*range(0, 100, 10), *range(100, 1001, 100))
     timeline = Timeline(pts, 0.01, None)
     assert choose_times(timeline, None, 150) == list(range(20))
@@ -442,7 +442,7 @@ def test_externals_name_what_is_read(posed: Path, images: Path) -> None:
     (posed / "notes").mkdir()
     assert externals(posed, config)["masks"] == posed / "masks"
     assert set(externals(posed, config)) == {"transforms", "images", "masks"}
-    # The folder of images alone has the same masks beside it.
+    # The folder of images alone has the same masks next to it.
     beside = {"capture": posed / "images", "masks": posed / "masks"}
     assert externals(posed / "images", config) == beside
 

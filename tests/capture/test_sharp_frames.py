@@ -1,4 +1,4 @@
-"""Of a video, the sharpest frame of each stretch of time is taken."""
+"""The sharpest frame of each stretch of a video is taken."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cleargs.stages.ingest import IngestConfig
 
 from .conftest import texture
 
-# Of 12 frames four are chosen evenly (0, 4, 7, 11), which splits the others into 0-2, 3-5, 6-9 and 10-11.
+# Four of 12 frames are chosen evenly (0, 4, 7, 11), which splits the others into 0-2, 3-5, 6-9 and 10-11.
 SHARP = [1, 3, 9, 10]
 
 

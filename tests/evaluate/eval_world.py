@@ -47,7 +47,7 @@ PLAIN = EvalOptions(lpips=(), scorers=())
 
 @dataclass
 class Remarks(SilentReporter):
-    """Keeps what it is told."""
+    """Keep the messages."""
 
     infos: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

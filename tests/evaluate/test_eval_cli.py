@@ -153,7 +153,7 @@ def test_an_evaluation_stays_beside_those_of_other_stages_and_options(
     assert noted() == [("g0", False), ("g0", True), ("rivr", False)]
     rows = pq.read_table(run / "eval" / "truth" / "eval.parquet").to_pylist()
     assert [row["adjusted"] for row in rows[::6]] == ["nothing", "colours", "nothing"]
-    shutil.rmtree(run / "rivr")  # made anew with other settings: its old figures are no longer its own
+    shutil.rmtree(run / "rivr")  # rebuilt with other settings: its old figures no longer belong to it
     add_scene(run, "rivr", make_scene(seed=2))
     shell(run, "--reference", truth, "--stage", "g0", *FAST)
     assert noted() == [("g0", False), ("g0", True)]

@@ -200,7 +200,7 @@ def test_distorted_references_are_undistorted(tmp_path: Path) -> None:
     assert psnr_of(found) > psnr_of(without) + 5
 
 
-# -- what is compared --------------------------------------------------------------------------------------
+# -- compared pixels ---------------------------------------------------------------------------------------
 
 
 def test_held_out_frames_with_their_masks(tmp_path: Path) -> None:
@@ -422,7 +422,7 @@ def test_held_out_frames_of_a_rig_share_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["COLMAP's name", "transparency"])
 def test_masks_of_references_are_those_of_ingest(tmp_path: Path, kind: str) -> None:
-    """What training ignores is not held against the scene."""
+    """Pixels that training ignores do not lower the figures."""
     scene = make_scene()
     run = write_run(tmp_path / "run", scene, cameras())
     pictures = [picture(scene, camera) for camera in cameras()]

@@ -1,4 +1,4 @@
-"""What lies behind the sparse points, and what is clipped."""
+"""Pixels behind the sparse points, and clipped pixels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0, np.eye(4))
 def test_the_farthest_point_is_one_that_the_view_sees() -> None:
     rng = np.random.default_rng(0)
     seen = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), rng.uniform(2.0, 5.0, 200)])
-    outliers = np.array([[0, 0, -9.0], [90, 0, 9], [0, 0, 500]])  # behind, beside, and one wrong match
+    outliers = np.array([[0, 0, -9.0], [90, 0, 9], [0, 0, 500]])  # behind, outside, and one wrong match
     farthest = depth_of_points(np.vstack([seen, outliers]), CAMERA)
     assert farthest is not None and 4.8 < farthest <= 5.0
     assert depth_of_points(seen[:9], CAMERA) is None

@@ -340,7 +340,7 @@ def test_trust_is_earned() -> None:
     }
     formation = CaptureFormation(seen, LOOK, known=known)
     assert [formation.weight(k) for k in (0, 1, 3)] == [1.0, 1.0, 1.0]
-    # The weights add up to 3.3; half of it lies with the second of .008, .010, .012, .016 and .05.
+    # The weights add up to 3.3; half of that is reached at the second of .008, .010, .012, .016 and .05.
     assert formation.weight(2) == pytest.approx(0.010 / 0.016)
     assert formation.weight(4) == 0.1  # not explained: RVA's
 
@@ -367,7 +367,7 @@ def test_the_table_gives_back_what_was_found(tmp_path: Path) -> None:
 
 
 def test_a_frame_is_rendered_with_a_margin() -> None:
-    """What moved in from beyond the border is explained too."""
+    """Content that moved in from outside the border is explained too."""
     seen = views()
     moved = FrameFormation(BLURRED, BLUR, "blur", reach_px=4.0)
     wide = render_observed(scene(), seen[BLURRED], formation=moved)

@@ -1,4 +1,4 @@
-"""The test that says if an observed frame is blurrier than a render: known blurs, and what is no blur."""
+"""The test that says if an observed frame is blurrier than a render: blurs, and other differences."""
 
 from __future__ import annotations
 

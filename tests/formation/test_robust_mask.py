@@ -1,4 +1,4 @@
-"""How much pixels count that the scene does not explain."""
+"""Weights of pixels that the scene does not explain."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def picture() -> Tensor:
 
 
 def disc() -> Tensor:
-    """Where something stands in front of the scene, [H, W]: a radius of a tenth of the width."""
+    """Mask [H, W] of an object in front of the scene: a disc with a radius of a tenth of the width."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     return torch.from_numpy(np.hypot(x - 60, y - 50) < 0.1 * WIDTH)
 
@@ -30,7 +30,7 @@ def counts(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
 
 
 def test_a_frame_with_nothing_unexplained_counts_whole_to_the_bit() -> None:
-    """Noise, missing detail and another exposure are no things that move."""
+    """Noise, missing detail and another exposure are not mistaken for movement."""
     seen = picture()
     noise = 2 / 255 * torch.from_numpy(np.random.default_rng(1).standard_normal(seen.shape)).float()
     soft = torch.from_numpy(cv2.GaussianBlur(seen.numpy(), (0, 0), 1.0))

@@ -1,4 +1,4 @@
-"""What happened while a frame was taken: found."""
+"""The search finds how the camera moved during a frame."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_flow_is_that_of_a_small_camera_motion() -> None:
         moved = points - small[:3] * MEDIAN - np.cross(small[3:], points)
         u = CAMERA.fx * moved[..., 0] / moved[..., 2] + CAMERA.cx
         v = CAMERA.fy * moved[..., 1] / moved[..., 2] + CAMERA.cy
-        # What a linear flow of a tenth of a pixel neglects is of the second order: 1e-4 px here.
+        # The error of a linear flow of a tenth of a pixel is of the second order: 1e-4 px here.
         np.testing.assert_allclose(0.1 * basis[component], np.stack([u - x, v - y]), atol=3e-4)
 
 
@@ -74,7 +74,7 @@ def test_the_flow_of_a_reduced_view_is_reduced() -> None:
     ids=["turn", "long turn with roll", "step", "rolling shutter", "both", "defocus"],
 )
 def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model) -> None:
-    """By what it does to the image: turns and steps to the side are alike where the depth hardly varies."""
+    """By its effect on the image: turns and sideways steps look alike if the depth varies little."""
     found = preferred(search(frame_pair(soft(truth), observe(truth, motion))))
     assert found.model == model
     assert found.explained > 0.3
@@ -88,7 +88,7 @@ def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model)
 
 def test_a_sharp_frame_is_left_alone(truth: Image) -> None:
     found = preferred(search(frame_pair(soft(truth), observe(truth, FrameMotion()))))
-    # A soft render beside a sharp frame: nothing that a camera does makes the render sharper.
+    # A soft render next to a sharp frame: nothing that a camera does makes the render sharper.
     assert found.explained < 0.01
 
 
@@ -179,7 +179,7 @@ def test_misfits_count_what_has_a_weight_and_nothing_else() -> None:
             above, below = ((1 - a) * image[k, i] + a * image[k, i + 1] for k in (j, j + 1))
             seen.append((1 - b) * above + b * below)
         expected[y] += weight[y, x] * min(abs(observed[y, x] - np.mean(seen)), limit)
-    # float32 within: 1e-7 of a light of 1, a dozen pixels a row.
+    # float32 within: 1e-7 of a light of 1, a dozen pixels per row.
     np.testing.assert_allclose(rows, expected, atol=5e-6)
 
 

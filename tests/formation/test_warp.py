@@ -54,7 +54,7 @@ def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int
     expected = oracle(image[..., :3], warp)
     made = warp.forward(image)[..., :3]
     assert made.std() > 0.01
-    # Positions of up to 240 px in float32 are good to 1.5e-5 px, and the image changes by at most 1 a pixel.
+    # Positions of up to 240 px in float32 are good to 1.5e-5 px, and the image changes by up to 1 per pixel.
     np.testing.assert_allclose(made, expected.detach().numpy(), atol=5e-5)
     light = random_image(*fields.radius.shape)
     expected.backward(light[..., :3].double())
@@ -116,7 +116,7 @@ def test_hard_cases_equal_the_oracle(case: str, device: torch.device) -> None:
     expected = oracle(image[..., :3], warp)
     expected.backward(light[..., :3].double())
     gradient = expected.image.grad
-    # Positions of some 40 px in float32 are good to 4e-6 px, and the image changes by at most 1 a pixel; the
+    # Positions of some 40 px in float32 are good to 4e-6 px, and the image changes by up to 1 per pixel; the
     # worst is 1.4e-6. Light piles up at the borders: errors relative to the most that is sent to a place.
     pile = max(1.0, float(gradient.abs().max()))
     assert (made[..., :3] - expected).abs().max() < 6e-6
@@ -235,7 +235,7 @@ def test_two_passes_give_what_one_with_all_samples_gives() -> None:
     image = torch.from_numpy(padded(np.repeat(waves[..., None], 3, 2).astype(np.float32)))
     difference = (two.forward(image) - one.forward(image))[:, :, 0].abs().numpy()
     # The waves span 0.4; a sixth of the exposure is up to 6 px, and so far the step shows: 0.029. Elsewhere
-    # 5e-4, at a border, where what lies beyond is taken for alike.
+    # 5e-4, at a border, where pixels outside the image are assumed to equal it.
     assert difference[:, 95:105].max() < 0.04
     assert max(difference[:, :95].max(), difference[:, 105:-4].max()) < 1e-3
 

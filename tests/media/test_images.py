@@ -95,7 +95,7 @@ def test_a_mask_of_zeros_and_ones(tmp_path: Path) -> None:
     labels = np.eye(4, dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "mask.png"), labels)
     assert np.array_equal(read_mask(tmp_path / "mask.png"), labels * 255)
-    faint = 3 * labels  # black, but for what a codec left
+    faint = 3 * labels  # black except for a codec's noise
     cv2.imwrite(str(tmp_path / "faint.png"), faint)
     assert not read_mask(tmp_path / "faint.png").any()
     cv2.imwrite(str(tmp_path / "nothing.png"), 0 * labels)

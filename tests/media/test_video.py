@@ -142,7 +142,7 @@ def test_hdr_is_tone_mapped(tmp_path: Path, transfer: str, code: int) -> None:
 
 
 def test_hdr_reference_white_and_curve() -> None:
-    # BT.2408: reference white is 58 % of PQ and 75 % of HLG; the curve brings it to 0.8 linear.
+    # BT.2408: reference white is 58 % of PQ and 75 % of HLG; the curve maps it to 0.8 linear.
     white = KNEE + (1 - KNEE) / 2
     for transfer, signal in (("pq", 0.5807), ("hlg", 0.75)):
         grey = srgb_from_hdr(np.full((1, 1, 3), signal), transfer)
@@ -259,7 +259,7 @@ def test_truncated_video(tmp_path: Path, faststart: bool) -> None:
 
 
 def test_truncated_matroska(tmp_path: Path) -> None:
-    """The demuxer ends quietly where the file does; only the stated length tells."""
+    """The demuxer ends without an error where the file ends; only the stated length shows the damage."""
     whole, cut = tmp_path / "whole.mkv", tmp_path / "cut.mkv"
     encode(whole, bar_planes("bt709", False), pts=tuple(range(0, 360, 3)))
     assert len(read_timeline(whole).pts) == 120

@@ -1,4 +1,4 @@
-"""What the candidates of RIVR are worth, where the sharp truth is known.
+"""Quality of RIVR's candidates against a known sharp truth.
 
 python tests/rivr/against_truth.py RUN...     PSNR and LPIPS of every layer of the EXRs of finished runs
 

@@ -20,7 +20,7 @@ from cleargs.types import ImageF32
 Fault: TypeAlias = Callable[[ImageF32, np.random.Generator], ImageF32]
 
 SIDE = 64
-"""Of the block that a local fault strikes, px."""
+"""Side of the block that a local fault changes, px."""
 
 
 def shifted(pixels: int) -> Fault:

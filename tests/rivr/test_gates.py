@@ -1,4 +1,4 @@
-"""Which repairs are refused: those with a planted fault, and not those that only remove blur."""
+"""The gates refuse repairs with a planted fault, and accept those that only remove blur."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_perfect_repair_is_admitted(sharp: ImageF32, observed: ImageF32, rende
 
 
 def test_either_witness_suffices(sharp: ImageF32, observed: ImageF32, render: ImageF32) -> None:
-    """What lies where the raw frame lies may be far from the render, and the other way round."""
+    """A repair may be aligned with the raw frame and not with the render, or the reverse."""
     off = np.roll(render, 4, axis=0)
     assert rejection_reason(sharp, observed, off, LIMITS) is None
     assert rejection_reason(np.roll(sharp, 4, axis=0), observed, off, LIMITS) is None
@@ -84,7 +84,7 @@ FOUND = {
     "shift 4 px": "out of place",
     **dict.fromkeys(["tint 16%", "half the contrast"], "off colour"),
 }
-"""Of `FAULTS`, those that docs/experiments/rivr.md reports as always found, and what they are found by."""
+"""Those of `FAULTS` that docs/experiments/rivr.md reports as always found -> the gate that finds them."""
 
 
 @pytest.mark.parametrize("name", FOUND)

@@ -110,7 +110,7 @@ def test_steps_of_groups_without_a_repair_go_to_the_next(capture: Capture) -> No
 
 
 def test_every_frame_is_a_target_and_nothing_is_judged(capture: Capture) -> None:
-    """The paper's way: nothing held back, no veto even of a wrecked scene."""
+    """The paper's way: no frame is held out, no veto even of a wrecked scene."""
     wrecking = tiny_g0(lr_scales=3.0)
     config = tiny_rivr(rounds=1, group=4, harm={"held_back": 0.0, "psnr_margin": 0.0, "score_margin": 0.0})
     context = capture.context("rivr", config, g0=wrecking)
@@ -136,7 +136,7 @@ def test_even_draws_raw_and_repaired_views_alike(capture: Capture) -> None:
 
 
 def run_both(capture: Capture) -> dict[str, dict[str, str]]:
-    """Both stages, three groups a round; the digests of their files."""
+    """Both stages, three groups per round; the digests of their files."""
     first = capture.context("rivr", tiny_rivr(group=3))
     rivr.run(first)
     second = capture.context("consolidate", tiny_consolidate())
@@ -150,7 +150,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
         return run_both(make_capture(tmp_path_factory.mktemp("undisturbed"), Sharpen(), patch))
 
 
-# Three groups a round: frames 0 1 | 2 4 | 5 6 7, of 3, 3 and 6 steps.
+# Three groups per round: frames 0 1 | 2 4 | 5 6 7, of 3, 3 and 6 steps.
 @pytest.mark.parametrize(
     ("where", "after"),
     [

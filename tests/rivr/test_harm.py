@@ -1,4 +1,4 @@
-"""When a distilled scene is rejected."""
+"""Conditions for the rejection of a distilled scene."""
 
 from __future__ import annotations
 

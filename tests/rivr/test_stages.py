@@ -109,7 +109,7 @@ def test_every_round_repairs_every_target(capture: Capture, expert: Sharpen) -> 
         assert exr.attributes["cleargs:round"] == row.round
         assert exr.attributes["cleargs:chosen"] == row.chosen
         plain = ImageBuf(str(context.out / row.exr)).get_pixels(HALF)[..., :3]
-        np.testing.assert_array_equal(plain, exr.layers[row.chosen])  # what ordinary programs show
+        np.testing.assert_array_equal(plain, exr.layers[row.chosen])  # the layer that ordinary programs show
         assert exr.attributes["cleargs:primary_fused"] == row.primary_fused
         images = {name: from_layer(layer) for name, layer in exr.layers.items()}
         fused = fuse(images["render"], images["restored"], 2.0)
@@ -162,7 +162,7 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
     rivr.run(context)
     rows = tried_rows(context)
     sharp = {row.frame_id for row in rows if row.restored_from == "observation"}
-    # Every round renders, and so deblurs, anew; a frame that nothing explains is restored once as it is.
+    # Every round renders, and so deblurs, again; a frame that nothing explains is restored once as it is.
     assert expert.calls == sum(row.restored_from == "deblurred" for row in rows) + len(sharp)
     blur = dict.fromkeys(((n, k) for n in (1, 2) for k in TARGETS), 0.0)
     for row in rows:
@@ -192,7 +192,7 @@ def test_without_fusion_there_are_two_candidates(capture: Capture) -> None:
 
 
 class Faithful:
-    """An expert that leaves images as they are, but for a little grain."""
+    """An expert that leaves images as they are, except for a little grain."""
 
     name = "faithful"
     digest = "none"
@@ -203,8 +203,10 @@ class Faithful:
 
 
 def keeping(**changes: Any) -> Any:
-    """The default: motion undone, no fusion, raw frames kept. The stand-in scorers have no calibrated scale,
-    so that the margin leaves the choice to them only where they differ grossly.
+    """Return the default settings: motion undone, no fusion, raw frames kept.
+
+    The stand-in scorers have no calibrated scale. The margin leaves the choice to them only where they differ
+    much.
     """
     return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, **changes)
 
@@ -356,7 +358,7 @@ def test_masked_pixels_do_not_reach_the_scores(
 
 @pytest.mark.parametrize("stage", ["rivr", "consolidate"])
 def test_harm_keeps_the_better_scene(capture: Capture, stage: str) -> None:
-    """Rates that wreck the scene: it is not published, and lies beside the one that is."""
+    """Rates that wreck the scene: it is not published, but stored next to the one that is."""
     wrecking, strict = tiny_g0(lr_scales=3.0), tiny_rivr(harm={"psnr_margin": 0.5, "score_margin": 100})
     if stage == "rivr":
         context, better = capture.context("rivr", strict, g0=wrecking), capture.root / "g0"
@@ -469,7 +471,7 @@ def run_both(capture: Capture, *, threads: int) -> dict[str, dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
-    """What both stages leave when nothing disturbs them, on one thread."""
+    """Results of both stages on one thread when nothing disturbs them."""
     with pytest.MonkeyPatch.context() as patch:
         return run_both(make_capture(tmp_path_factory.mktemp("undisturbed"), Sharpen(), patch), threads=1)
 
@@ -516,14 +518,14 @@ def test_a_damaged_exr_is_made_again(capture: Capture, undisturbed: dict[str, di
 def test_exrs_that_no_frame_of_the_round_left_are_not_published(
     capture: Capture, undisturbed: dict[str, dict[str, str]]
 ) -> None:
-    """Of a held-back frame, of a round too many, or under another frame's name."""
+    """EXRs of a held-out frame, of a round too many, or under another frame's name."""
     assert run_both(capture, threads=1) == undisturbed
     out = capture.root / "run" / "rivr"
     image = (out / "round_01" / "000004.exr").read_bytes()
     (out / "round_09").mkdir()
     for place in (f"round_01/{HELD_BACK:06d}.exr", "round_01/x.exr", "round_09/000004.exr"):
         (out / place).write_bytes(image)
-    for number, frame in ((1, 5), (2, 4)):  # of another frame, and of another round
+    for number, frame in ((1, 5), (2, 4)):  # another frame's, and another round's
         (out / f"round_{number:02d}" / f"{frame:06d}.exr").write_bytes(image)
     assert run_both(capture, threads=1) == undisturbed
 

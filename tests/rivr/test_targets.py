@@ -1,4 +1,4 @@
-"""Which frames are repaired, and which judge the result."""
+"""Choice of the frames to repair, and of those that measure the result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROLES = ["strong", "geometric", "suppressed", "strong", "reactivated", "auxiliar
 
 
 def supervision() -> Supervision:
-    """Frame 13 is held back; a number stands for its view."""
+    """Frame 13 is held out; a number stands for its view."""
     views: Any = {frame_id: frame_id for frame_id in range(10, 16)}
     return Supervision(views, appraised(ROLES), [13])
 

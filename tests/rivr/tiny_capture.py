@@ -88,7 +88,7 @@ class Capture:
         self.root = root
 
     def use_good_scene(self) -> None:
-        """Give G0 nearly the scene that the frames show: sharp enough to tell how they were taken."""
+        """Give G0 nearly the scene that the frames show: sharp enough to estimate how they were taken."""
         nearly = scene()
         nearly.sh += 0.05
         write_ply(self.root / "g0" / "scene.ply", Scene(nearly))
@@ -131,8 +131,9 @@ def tried_rows(context: StageContext[Any]) -> list[Selection]:
 
 
 def tiny_rivr(**changes: Any) -> RivrConfig:
-    """Two rounds of a few steps, no margin of harm exceeded; the paper's rules: raw frames as they are, three
-    candidates, and every target frame gets a pseudo observation.
+    """Return settings of two rounds of a few steps, within the margins of harm, with the paper's rules.
+
+    Raw frames stay as they are, there are three candidates, and every target frame gets a pseudo observation.
     """
     settings: dict[str, Any] = {
         "rounds": 2,

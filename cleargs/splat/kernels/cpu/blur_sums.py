@@ -29,7 +29,7 @@ def blur_sums(
     render: ArrayF32,  # [H, W] linear light, smoothed
     observed: ArrayF32,  # [H, W] likewise
     weight: ArrayF32,  # [H, W] 0 where a pixel does not count
-    stride: int,  # of the rows and columns that are read
+    stride: int,  # distance of the rows and columns that are read, px
     tile: int,  # side of the tiles, px
     sums: AnyArray,  # [R, 2, TERMS, TERMS] float64, written: R rows are read (lower triangles)
 ) -> None:
