@@ -29,6 +29,8 @@ SETTINGS = {
     "g0.budget": "2000",
     "g0.checkpoint_interval": "10",
     "rivr.rounds": "2",
+    "rivr.targets": "all",
+    "rivr.keep_raw": "false",  # each frame gets a repair, so that the second round is run
     "rivr.distil.steps": "20",
     "consolidate.distil.steps": "20",
 }
