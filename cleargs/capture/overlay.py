@@ -79,7 +79,7 @@ def wraps_around(rgb: NDArray[np.uint8]) -> bool:  # [H, W, 3]
         return False
     columns = rgb.astype(np.float32)
     across = float(np.abs(columns[:, 0] - columns[:, -1]).mean())
-    beside = float(np.abs(np.diff(columns, axis=1)).mean())
+    adjacent = float(np.abs(np.diff(columns, axis=1)).mean())
     # Half a picture apart, columns are as different as chance has it.
     apart = float(np.abs(columns[:, 0] - columns[:, width // 2]).mean())
-    return across <= 3 * beside and across < 0.5 * apart
+    return across <= 3 * adjacent and across < 0.5 * apart

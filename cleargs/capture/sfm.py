@@ -105,7 +105,7 @@ def reconstruct(
     similarity = worlds[outcome.convention][0]
     if outcome.convention != OWN:
         reporter.warn(
-            f"the poses do not fit the images as they should be meant: read as {outcome.convention}"
+            f"the poses do not fit the images in the convention of the input: read as {outcome.convention}"
         )
     _report_outcome(outcome, float(np.median(model.error)), config, reporter)
     if outcome.method == "sfm":

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from cleargs.formation.motion import FrameMotion, Model, flow_basis, widened
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
+from cleargs.splat.backend import SearchKernels
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
@@ -101,36 +101,6 @@ def scales(pair: FramePair) -> list[float]:
     elif sizes[-1] < longest <= LEVELS[-1][0]:
         sizes.append(longest)
     return [size / longest for size in sizes]
-
-
-class SearchKernels(Protocol):
-    """Kernels that a search for a frame's motion runs. The CPU's back end has them; others may be passed."""
-
-    def misfit(
-        self,
-        image: ArrayF32,
-        observed: ArrayF32,
-        weight: ArrayF32,
-        fields: tuple[ArrayF32, ArrayF32, ArrayF32],
-        samples: ArrayF32,
-        limit: float,
-    ) -> float:
-        """Return the sum of weight * min(|observed - exposed image|, limit)."""
-
-    def normal_equations(
-        self,
-        stack: ArrayF32,
-        observed: ArrayF32,
-        weight: ArrayF32,
-        basis: ArrayF32,
-        down: ArrayF32,
-        offset: ArrayF32,
-        sweep: ArrayF32,
-        times: ArrayF32,
-        outlier: float,
-        active: NDArray[np.int64],
-    ) -> tuple[ArrayF64, ArrayF64]:
-        """Return matrix [A, A] and right side [A] of a Gauss-Newton step over the ``active`` numbers."""
 
 
 class Level:

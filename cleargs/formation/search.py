@@ -19,10 +19,10 @@ from cleargs.formation.comparison import (
     FramePair,
     Level,
     MotionFit,
-    SearchKernels,
     scales,
 )
 from cleargs.formation.motion import TWIST, FrameMotion, Model
+from cleargs.splat.backend import SearchKernels
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.types import ArrayF64
 

@@ -52,10 +52,14 @@ def open_photo(path: Path, kind: str) -> Image.Image:
         with warnings.catch_warnings(action="ignore"):  # about its size, which is checked elsewhere
             return Image.open(path)
     except _FAULTS as error:
-        raise InputError(
-            f"{path} is not an image that can be read: {cause(error)}",
-            hint="copy the file again, convert it to JPEG or PNG, or remove it",
-        ) from error
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    return InputError(
+        f"{path} is not an image that can be read: {cause(error)}",
+        hint="copy the file again, convert it to JPEG or PNG, or remove it",
+    )
 
 
 def photo_orientation(photo: Image.Image) -> int:
@@ -73,10 +77,7 @@ def decode_photo(path: Path, photo: Image.Image) -> NDArray[np.uint8]:
     try:
         return np.asarray(photo.convert("RGBA" if photo.has_transparency_data else "RGB"), np.uint8)
     except _FAULTS as error:
-        raise InputError(
-            f"{path} is not an image that can be read: {cause(error)}",
-            hint="copy the file again, convert it to JPEG or PNG, or remove it",
-        ) from error
+        raise _unreadable(path, error) from error
 
 
 def srgb_from_profile(rgb: NDArray[np.uint8], profile: bytes) -> NDArray[np.uint8]:  # [H, W, 3]

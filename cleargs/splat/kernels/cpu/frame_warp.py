@@ -180,7 +180,7 @@ def expose(
     height, width, _ = out.shape
     rows, columns, _ = image.shape
     right, bottom = np.float32(columns - 1), np.float32(rows - 1)
-    beside, below = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
+    next_column, next_row = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
     share = _ONE / np.float32(len(samples))
     cubic = len(samples) == 1
     for y in prange(height):
@@ -195,7 +195,7 @@ def expose(
                     place = _seen_from(start, along, wide, samples, k)
                     a, b = fractions_of(place)
                     at = offset_of(place, columns)
-                    above, under = load_pair(image, at), load_pair(image, at + below)
+                    above, under = load_pair(image, at), load_pair(image, at + next_row)
                     sums = sums + (above * (_ONE - b) + under * b) * shares(a)
                 store(out, CHANNELS * (y * width + x), sum_of(sums) * share)
                 continue
@@ -213,9 +213,9 @@ def expose(
                     continue
                 at = CHANNELS * (np.int64(j) * columns + i)
                 total = total + load_pixel(image, at) * ((_ONE - b) * (_ONE - a))
-                total = total + load_pixel(image, at + beside) * ((_ONE - b) * a)
-                total = total + load_pixel(image, at + below) * (b * (_ONE - a))
-                total = total + load_pixel(image, at + below + beside) * (b * a)
+                total = total + load_pixel(image, at + next_column) * ((_ONE - b) * a)
+                total = total + load_pixel(image, at + next_row) * (b * (_ONE - a))
+                total = total + load_pixel(image, at + next_row + next_column) * (b * a)
             store(out, CHANNELS * (y * width + x), total * share)
 
 
@@ -239,7 +239,7 @@ def spread(
     height, width, _ = light.shape
     columns = bands.shape[2]
     right, bottom = np.float32(columns - 1), np.float32(rows - 1)
-    beside, below = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
+    next_column, next_row = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
     share = _ONE / np.float32(len(samples))
     cubic = len(samples) == 1
     for band in prange(len(bands)):
@@ -261,7 +261,7 @@ def spread(
                         at = offset_of(place, columns) - CHANNELS * first * columns
                         across = shares(a)
                         store(part, at, load_pair(part, at) + twice * (across * (_ONE - b)))
-                        store(part, at + below, load_pair(part, at + below) + twice * (across * b))
+                        store(part, at + next_row, load_pair(part, at + next_row) + twice * (across * b))
                     continue
                 for k in range(len(samples)):
                     i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
@@ -276,9 +276,9 @@ def spread(
                         continue
                     at = CHANNELS * (np.int64(j - first) * columns + i)
                     _add(part, at, seen, (_ONE - b) * (_ONE - a))
-                    _add(part, at + beside, seen, (_ONE - b) * a)
-                    _add(part, at + below, seen, b * (_ONE - a))
-                    _add(part, at + below + beside, seen, b * a)
+                    _add(part, at + next_column, seen, (_ONE - b) * a)
+                    _add(part, at + next_row, seen, b * (_ONE - a))
+                    _add(part, at + next_row + next_column, seen, b * a)
 
 
 @inlined
