@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_run, usable_cores
+from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.progress import LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import SCENE, Prepared, Run, open_prepared
 from cleargs.splat.budget import resolve_config
@@ -44,9 +44,9 @@ Progress = Reporter | Say | None
 
 def run(
     source: str | Path,
-    folder: str | Path,
+    folder: str | Path | None = None,
     *,
-    workflow: str | None = None,
+    recipe: str | None = None,
     quality: Quality | None = None,
     set: Mapping[str, Any] | None = None,
     until: str | None = None,
@@ -57,6 +57,7 @@ def run(
     threads: int | None = None,
     store: str | Path | None = None,
     progress: Progress = None,
+    workflow: str | None = None,
 ) -> Run:
     """Turn a capture into a clean scene in the run folder ``folder``, as ``cleargs run`` does.
 
@@ -64,8 +65,9 @@ def run(
 
     Args:
         source: A video, an image folder, a COLMAP project, or a folder with ``transforms.json``.
-        folder: The run folder, which is created if necessary.
-        workflow: Name or path of a recipe. Without one, an existing run keeps its settings.
+        folder: The run folder, which is created if necessary (default: next to the capture, as
+            ``cleargs run`` chooses it).
+        recipe: Name or path of a recipe. Without one, an existing run keeps its settings.
         quality: Cost of the trainings: draft, standard or high (setting ``g0.quality``).
         set: Settings by name, for example ``{"rva.tau_R": 0.6}``.
         until: The last stage to run (default: all stages).
@@ -76,6 +78,7 @@ def run(
         threads: Number of threads (default: all usable cores).
         store: Folder for results (default: that of the run, or ``.store`` in ``folder``).
         progress: Receiver of progress and remarks.
+        workflow: Former name of ``recipe``.
 
     Raises:
         InputError: if the capture or a setting cannot be used.
@@ -92,8 +95,8 @@ def run(
     spec = resolve_run(
         dag,
         Path(source),
-        Path(folder),
-        workflow=workflow,
+        default_folder(Path(source)) if folder is None else Path(folder),
+        recipe=recipe or workflow,
         overrides=[
             *([f"g0.quality={quality}"] if quality else []),
             # Settings are parsed as TOML, which reads these JSON values too.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest, read_manifest
 from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_run_file
 
 if TYPE_CHECKING:
@@ -19,10 +20,6 @@ if TYPE_CHECKING:
     from cleargs.splat.camera import Camera
     from cleargs.splat.scene import Scene
     from cleargs.splat.views import TrainingView
-
-
-SCENE = "scene.ply"
-"""File name of the scene in the results of a stage that trains."""
 
 
 def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:

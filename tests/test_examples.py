@@ -38,7 +38,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("examples")
     make_capture(folder / "room", "mixed", frames=8, width=96, height=54, seed=0, reporter=SilentReporter())
     (folder / "tiny.toml").write_text(TINY)
-    cg.run(folder / "room", folder / "run", workflow=str(folder / "tiny.toml"))
+    cg.run(folder / "room", folder / "run", recipe=str(folder / "tiny.toml"))
     return folder
 
 

@@ -19,6 +19,8 @@ from cleargs.cli.common import (
     quality_option,
     quiet_option,
     report_option,
+    until_option,
+    with_shortcuts,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -45,7 +47,7 @@ To run scenes in parallel on a cluster, see docs/cluster.md.
     metavar="BATCH",
     required=False,
 )
-@click.option("--until", metavar="STAGE", help="The last stage to run.")
+@until_option
 @quality_option
 @click.option(
     "--dry-run", is_flag=True, help="Only check the sheet; show which stages would run, and the cost."
@@ -62,7 +64,7 @@ def batch(
     sheet: Path,
     folder: Path | None,
     until: str | None,
-    quality: tuple[str, ...],
+    quality: str | None,
     dry_run: bool,
     summary: bool,
     wants_report: bool,
@@ -89,9 +91,10 @@ def batch(
     if not (looks_only and device == "cuda"):
         resolved = resolve_device(device, reporter.info, test=not looks_only)
     falls_back = device == "auto" and resolved == "cuda"
+    settings = with_shortcuts((), {"quality": quality})
     root = (folder or sheet.with_suffix(".batch")).absolute()
     try:
-        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, quality, options, falls_back)
+        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, settings, options, falls_back)
         scenes.check(sheet)
     except SheetError as error:
         for problem in error.problems:

@@ -18,8 +18,10 @@ def main() -> None:
     # Waiting OpenMP threads should sleep: awake, they take a core from other programs, or even from the
     # thread for which they wait. PyTorch reads the variable when it is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    from cleargs.cli.commands import name_program
     from cleargs.cli.main import main as run
 
+    name_program()
     try:
         run()
     finally:  # the command has ended: there is nothing left to interrupt

@@ -16,7 +16,6 @@ from cleargs.errors import InputError, StageError, StoreError
 from cleargs.manifest import read_manifest, write_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.stage import Estimate
 from cleargs.pipeline.store import Store
@@ -227,23 +226,6 @@ def test_stage_that_forgets_an_output_fails(bench: Bench) -> None:
     stages["count"].OUTPUTS = ("numbers", "nothing.txt")
     with pytest.raises(StageError, match=r"without its outputs nothing\.txt"):
         bench.run()
-
-
-def test_single_stage_needs_those_before_it(bench: Bench) -> None:
-    from cleargs.pipeline.runner import Runner
-
-    bench.run(until="count")
-    bench.work_done()
-    with DigestMemo(bench.store / "digests.sqlite") as memo:
-        run = read_run_file(bench.folder, bench.dag)
-        assert run == bench.settings()
-        runner = Runner(bench.dag, run, Store(run.store, memo), 1, bench.remarks)
-        with pytest.raises(StageError, match="total needs square, which is not done") as error:
-            runner.run_stage("total")
-        assert "cleargs stage square" in error.value.hint
-        runner.run_stage("square")
-        runner.run_stage("total")
-    assert stages_run(bench) == ["square", "total"]
 
 
 def test_full_disk_is_noticed_before_work(bench: Bench) -> None:
