@@ -1,7 +1,10 @@
 from cleargs.api import deblur as deblur
 from cleargs.api import evaluate_scene as evaluate_scene
+from cleargs.api import export as export
+from cleargs.api import film as film
 from cleargs.api import initialise as initialise
 from cleargs.api import load as load
+from cleargs.api import make_capture as make_capture
 from cleargs.api import render_view as render_view
 from cleargs.api import restore as restore
 from cleargs.api import run as run
@@ -9,6 +12,7 @@ from cleargs.api import save as save
 from cleargs.api import score as score
 from cleargs.api import score_frames as score_frames
 from cleargs.api import train as train
+from cleargs.api import write_report as write_report
 from cleargs.errors import CleargsError as CleargsError
 from cleargs.run_results import Prepared as Prepared
 from cleargs.run_results import Run as Run

@@ -253,6 +253,105 @@ def load(path: str | Path) -> Scene:
     return read_ply(Path(path))
 
 
+def export(run: Run, *files: str | Path, stage: str | None = None, **options: Any) -> list[str]:
+    """Write the scene of a run to files for other programs, as ``cleargs export`` does.
+
+    Args:
+        run: A run with a trained scene.
+        files: The new files. Their endings choose the formats (see `save`).
+        stage: The stage whose scene is written (default: the last one that has a scene).
+        options: Fields of `cleargs.render.export.ExportOptions`: ``up``, ``world``, ``metres``,
+            ``sh_degree``, ``prune``, ``crop``, ``cameras``, ``force``.
+
+    Returns:
+        Messages about the result.
+
+    Raises:
+        InputError: if an option cannot be used, or if a file exists.
+
+    Example:
+        cg.export(cg.open_run("run"), "blender.ply", up="z", sh_degree=3)
+    """
+    from cleargs.render.export import ExportOptions, export_scene
+
+    paths = [Path(file) for file in files]
+    return export_scene(
+        run.folder, run.scene_file(stage).parent.name, paths, ExportOptions(**options), log_reporter()
+    )
+
+
+def film(run: Run, file: str | Path, *, stage: str | None = None, **options: Any) -> Path:
+    """Render a film (.mp4) along the path of the capture, or stills (.png, .exr), as ``cleargs render`` does.
+
+    Args:
+        run: A run with a trained scene.
+        file: The new file.
+        stage: The stage whose scene is rendered (default: the last one that has a scene).
+        options: Fields of `cleargs.render.shots.ShotOptions`: ``frame``, ``turntable``, ``poses``, ``world``,
+            ``size``, ``fps``, ``seconds``, ``side_by_side``, ``codec``.
+
+    Raises:
+        InputError: if an option cannot be used, or if the file exists.
+
+    Example:
+        cg.film(cg.open_run("run"), "still.png", frame=3)
+    """
+    from cleargs.render.shots import ShotOptions, render_run
+
+    path = Path(file)
+    render_run(run.scene_file(stage), path, ShotOptions(**options), log_reporter())
+    return path
+
+
+def write_report(run: Run, *, threads: int | None = None) -> Path:
+    """Write the report of a run. Return the path of its page.
+
+    Example:
+        page = cg.write_report(cg.open_run("run"))
+    """
+    from cleargs.pipeline.plan import Planner
+    from cleargs.pipeline.run_file import read_run_file
+    from cleargs.report.page import write_report
+
+    dag = installed()
+    spec = read_run_file(run.folder, dag)
+    with opened_store(spec.store) as opened:
+        return write_report(Planner(dag, spec, opened, threads or usable_cores(), log_reporter()))
+
+
+def make_capture(
+    folder: str | Path,
+    protocol: str = "mixed",
+    *,
+    frames: int = 16,
+    size: tuple[int, int] = (480, 270),
+    seed: int = 0,
+    video: bool = False,
+) -> dict[str, Any]:
+    """Make a synthetic capture with known ground truth in a new folder, as ``cleargs synth`` does.
+
+    Returns:
+        The figures of the capture, for example its true blur.
+
+    Example:
+        cg.make_capture("small", "gs2e-medium", frames=4, size=(96, 64))
+    """
+    from cleargs.synth.synthetic_capture import make_capture
+
+    width, height = size
+    reporter = log_reporter()
+    return make_capture(
+        Path(folder),
+        protocol,
+        frames=frames,
+        width=width,
+        height=height,
+        seed=seed,
+        video=video,
+        reporter=reporter,
+    )
+
+
 def score_frames(
     paths: Sequence[str | Path],
     *,

@@ -32,12 +32,10 @@ from cleargs.pipeline.run_file import SCENE, Device, RunMetadata, RunSpec, read_
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
+from cleargs.render import PROGRAMS
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
 from cleargs.subprocesses import module_command
-
-PROGRAMS = ("blender", "unreal", "unity", "supersplat", "web")
-"""Programs of ``cleargs export --for``."""
 
 State = Literal["failed", "waiting", "partial", "done"]
 """``waiting``: stages are missing, and the last attempt, if any, reported no error."""
@@ -125,6 +123,10 @@ class Batch:
                     check_same_input(run, self.dag, store)
                 for stage in self.dag.until(self.until)[1:]:  # the first one's files are the capture
                     self.dag.load(stage).externals(run.config.effective[stage], run.source)
+                for ending in set(scene.after.export) - set(PROGRAMS):
+                    from cleargs.splat.formats import format_of  # loads torch
+
+                    format_of(Path(f"{scene.name}.{ending}"))
             except InputError as error:
                 problems.append(f"{scene.where}: {error}; {error.hint}")
         if problems:
@@ -142,7 +144,8 @@ class Batch:
         self.log(scene).write_text("", "utf-8")
         if self._call(scene, self.arguments(scene), reporter) == 0:
             for arguments in self.arguments_after(scene):
-                self._call(scene, arguments, reporter)
+                self.exports.mkdir(exist_ok=True)
+                self._call(scene, arguments, reporter, self.exports)
 
     def arguments_after(self, scene: SceneJob) -> Iterator[list[str]]:
         """Yield the arguments of ``cleargs`` for the work after ``scene`` that is missing or out of date."""
@@ -167,14 +170,15 @@ class Batch:
         """Folder of exported scenes and films."""
         return self.folder / "exports"
 
-    def _call(self, scene: SceneJob, arguments: Sequence[str], reporter: Reporter) -> int:
-        """Run ``cleargs`` in `exports`, and copy its output to the log and to ``reporter``."""
-        self.exports.mkdir(parents=True, exist_ok=True)
+    def _call(
+        self, scene: SceneJob, arguments: Sequence[str], reporter: Reporter, folder: Path | None = None
+    ) -> int:
+        """Run ``cleargs`` in ``folder``, and copy its output to the log and to ``reporter``."""
         with (
             self.log(scene).open("a", encoding="utf-8") as file,
             subprocess.Popen(
                 [*program(), *arguments],
-                cwd=self.exports,
+                cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -219,11 +223,11 @@ class Batch:
         except CleargsError as error:
             return "failed", str(error)
         unfinished = next((plan for plan in plans if plan.state != "done"), None)
-        if unfinished is None:
+        if unfinished is None and not any(self.arguments_after(scene)):
             last = plans[-1].manifest
             missing = last.inherited if last is not None else ()
             return ("partial", "; ".join(missing)) if missing else ("done", "")
-        if unfinished.state == "partial":
+        if unfinished is not None and unfinished.state == "partial":
             return "partial", "; ".join(unfinished.reasons)
         with suppress(OSError):  # no attempt yet
             lines = self.log(scene).read_text("utf-8", "replace").splitlines()

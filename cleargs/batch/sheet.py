@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -69,7 +69,7 @@ class SceneJob:
     """Settings in the form of ``--set``."""
     where: str
     """Place in the sheet, for messages."""
-    after: After = After()
+    after: After = field(default_factory=After)
 
 
 def read_scenes(path: Path) -> list[SceneJob]:
@@ -99,9 +99,7 @@ def read_scenes(path: Path) -> list[SceneJob]:
             problems.append(f"{where}: {scenes[row.name].where} already has the name {row.name!r}")
         recipe = str(folder / row.recipe) if row.recipe.endswith(".toml") else row.recipe
         overrides = tuple(f"{name}={value}" for name, value in row.set.items())
-        scenes[row.name] = SceneJob(
-            row.name, folder / row.input, recipe, overrides, where, row.after
-        )
+        scenes[row.name] = SceneJob(row.name, folder / row.input, recipe, overrides, where, row.after)
     if problems:
         raise SheetError(path, problems)
     if not scenes:

@@ -12,12 +12,14 @@ import click
 from cleargs.batch.loop import Batch, Result, write_summary
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.common import (
+    fail_below_option,
     json_option,
     output_option,
     partial_option,
     print_json,
     quality_option,
     quiet_option,
+    report_below,
     report_option,
     until_option,
     with_shortcuts,
@@ -53,6 +55,7 @@ To run scenes in parallel on a cluster, see docs/cluster.md.
     "--dry-run", is_flag=True, help="Only check the sheet; show which stages would run, and the cost."
 )
 @click.option("--summary", is_flag=True, help="Run nothing; write summary and page of the present results.")
+@fail_below_option("psnr_unseen, frames_placed ...")
 @report_option("Write a report of each scene, and BATCH/report/index.html with links to them.")
 @partial_option
 @work_options
@@ -67,6 +70,7 @@ def batch(
     quality: str | None,
     dry_run: bool,
     summary: bool,
+    fail_below: dict[str, float],
     wants_report: bool,
     allow_partial: bool,
     device: DeviceChoice,
@@ -127,7 +131,10 @@ def batch(
         click.echo("\n".join(_line(result) for result in results))
         click.echo(", ".join(f"{count} {state}" for state, count in states.items()))
         click.echo(f"summary: {root / 'summary.csv'}" + (f"\nreport: {page}" if page else ""))
-    return 1 if states["failed"] or states["waiting"] else 3 if states["partial"] else 0
+    numbers = ("frames", "frames_placed", "psnr_unseen", "minutes", "memory_gb", "disk_gb")
+    figures = {result.scene: {name: getattr(result, name) for name in numbers} for result in results}
+    below = report_below(figures, fail_below)
+    return 1 if below or states["failed"] or states["waiting"] else 3 if states["partial"] else 0
 
 
 def _line(result: Result) -> str:

@@ -264,6 +264,47 @@ def answer(as_json: bool, facts: Any, *lines: str) -> None:
             click.echo(line)
 
 
+def _limits(context: click.Context, parameter: click.Parameter, value: tuple[str, ...]) -> dict[str, float]:
+    found = {}
+    for text in value:
+        name, _, number = text.partition("=")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            raise click.BadParameter(f"{text!r} does not have the form FIGURE=VALUE") from None
+    return found
+
+
+def fail_below_option(figures: str) -> Callable[[F], F]:
+    """Return the option ``--fail-below``, whose value is figure -> limit; ``figures`` lists them."""
+    return click.option(
+        "--fail-below",
+        multiple=True,
+        metavar="FIGURE=VALUE",
+        callback=_limits,
+        help=f"End with exit code 1 if this figure of a result is below VALUE, or missing: {figures}.",
+    )
+
+
+def report_below(results: Mapping[str, Mapping[str, Any]], limits: Mapping[str, float]) -> bool:
+    """Print a line on stderr for each figure of ``results`` that is below its limit. Return True if one is.
+
+    Raises:
+        InputError: No result has a figure of this name.
+    """
+    failed = False
+    for figure, limit in limits.items():
+        if results and not any(figure in figures for figures in results.values()):
+            known = ", ".join(sorted({name for figures in results.values() for name in figures}))
+            raise InputError(f"there is no figure {figure!r}", hint=f"choose one of {known}")
+        for name, figures in results.items():
+            value = figures.get(figure)
+            if value is None or value < limit:
+                failed = True
+                click.echo(f"below the limit: {name}: {figure} {value} < {limit:g}", err=True)
+    return failed
+
+
 def with_shortcuts(overrides: Sequence[str], values: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the settings of the options in ``values`` (`SHORTCUTS`; None: not given), then ``overrides``.
 

@@ -11,9 +11,8 @@ from cleargs.cli.common import FILE, answer, json_option, quiet_option, run_argu
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
+from cleargs.render import PROGRAMS
 from cleargs.run_results import scene_stage
-
-PROGRAMS = ("blender", "unreal", "unity", "supersplat", "web")
 
 
 @click.command(

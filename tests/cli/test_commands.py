@@ -17,12 +17,14 @@ from toy import Bench
 
 from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.cli.run import outcome_lines
+from cleargs.cli.run import outcome_lines, without_effect
 from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import StageOutcome
-from cleargs.pipeline.session import usable_cores
+from cleargs.pipeline.session import default_folder, usable_cores
 
 
 @pytest.fixture
@@ -578,6 +580,181 @@ def test_gc_refuses_a_folder_that_is_not_a_store(shell: Shell, tmp_path: Path) -
         assert code == 2 and "is not a store" in errors
     assert thesis.is_file()
     assert "reused: count, square, total" in shell.run()[1]
+
+
+@pytest.mark.parametrize(
+    ("made", "source", "folder"),
+    [
+        ("walk.mp4", "walk.mp4", "walk"),
+        ("walk.mp4 walk/", "walk.mp4", "walk-scene"),
+        ("walk.mp4 walk/run.toml", "walk.mp4", "walk"),
+        ("walk/", "walk", "walk-scene"),
+        ("walk", "walk", "walk-scene"),
+        ("walk.images/", "walk.images/", "walk.images-scene"),
+        ("place/walk/", "place/walk/../walk/.", "place/walk-scene"),
+    ],
+)
+def test_the_run_folder_is_next_to_the_input(
+    made: str, source: str, folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in made.split():
+        path = Path(name)
+        (path if name.endswith("/") else path.parent).mkdir(parents=True, exist_ok=True)
+        if not name.endswith("/"):
+            path.touch()
+    assert default_folder(Path(source)).resolve() == tmp_path / folder
+    if Path(source).is_dir():
+        monkeypatch.chdir(source)
+        assert default_folder(Path()).resolve() == tmp_path / folder
+
+
+def test_a_run_by_the_name_of_its_input_alone(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = sorted(shell.bench.capture.iterdir())
+    code, out, _ = shell("run", str(shell.bench.capture), "--recipe", shell.recipe)
+    folder = shell.bench.capture.with_name(f"{shell.bench.capture.name}-scene")
+    assert code == 0 and out.startswith(f"results: {folder}/total")
+    assert sorted(shell.bench.capture.iterdir()) == before, "nothing is written into the input"
+
+
+def test_the_run_folder_has_a_log_and_a_link_to_the_scene(shell: Shell) -> None:
+    shell.run("--log", str(shell.bench.root / "mine.log"), "-q")
+    log = (shell.bench.folder / "run.log").read_text()
+    assert "square: started" in log and "results: " in log, "whatever is printed"
+    assert "square: started" in (shell.bench.root / "mine.log").read_text()
+    (shell.bench.capture / "1.txt").write_text("no number")
+    assert again(shell)[0] == 1
+    assert "error: unexpected ValueError" in (shell.bench.folder / "run.log").read_text()
+    assert "key " in shell.run("-v", "--until", "count")[2]
+
+
+def test_events_are_json_lines(shell: Shell) -> None:
+    events = [json.loads(line) for line in shell.run("--progress", "json")[2].splitlines()]
+    assert {event["event"] for event in events} >= {"info", "begin", "end"}
+    assert any(event.get("text", "").startswith("square: started") for event in events)
+
+
+def test_one_setting_twice_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["run", str(tmp_path), "--steps", "30", "--set", "g0.steps=40"]
+    assert invoke(given) == 2 and "--steps and --set g0.steps" in capsys.readouterr().err
+    assert invoke([*given[:3], "30", *given[4:5]]) == 2  # --set without a value
+
+
+def test_options_without_effect_are_named() -> None:
+    dag = installed()
+    given = ["g0.quality=draft", "ingest.max_frames=100"]
+    (line,) = without_effect(load_config(dag, overrides=given), given)
+    assert line == "ingest.max_frames=100 has no effect: with quality draft it is 60"
+    (line,) = without_effect(load_config(dag, "smoke", ["g0.quality=high"]), ["g0.quality=high"])
+    assert "g0.steps=400" in line and "g0.budget=30000" in line and "--reset" in line
+    assert not list(without_effect(load_config(dag, overrides=["g0.quality=high"]), ["g0.quality=high"]))
+
+
+@pytest.mark.parametrize(
+    ("given", "hint"),
+    [
+        ("rnu", "did you mean cleargs run?"),
+        ("explian", "did you mean cleargs status?"),
+        ("walk.mp4", "did you mean cleargs run walk.mp4?"),
+        ("no idea", "see cleargs --help"),
+    ],
+)
+def test_a_wrong_command_is_guessed(given: str, hint: str, shell: Shell) -> None:
+    code, _, err = shell(given)
+    assert code == 2 and err.splitlines()[1] == f"hint: {hint}"
+
+
+def test_a_path_in_place_of_a_command(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    shell.run()
+    monkeypatch.chdir(shell.bench.root)
+    shell.bench.folder.rename("room")
+    for name, command in ((shell.bench.capture.name, "run"), ("room", "show")):
+        assert f"did you mean cleargs {command} {name}?" in shell(name)[2]
+
+
+def test_other_ways_to_ask_for_help(shell: Shell) -> None:
+    assert shell("help", "status") == shell("status", "--help")
+    assert shell("help") == shell("--help") and shell("-V") == shell("--version")
+    sections = shell("--help")[1].partition("More:")[0]
+    listed = [name for name in COMMANDS if f"\n  {name} " in sections]
+    assert 12 <= len(listed) <= 15 and {"run", "report", "export"} <= set(listed)
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("cleargs sta", ["status", "stage"]),
+        ("cleargs run x --until r", ["rva", "rivr"]),
+        ("cleargs run x --recipe pa", ["paper", "paper-open"]),
+        ("cleargs run x --set g0.ste", ["g0.steps="]),
+        ("cleargs synth x --protocol gs2e-s", ["gs2e-slight", "gs2e-severe", "gs2e-stretches"]),
+        ("cleargs show x in", ["ingest"]),
+    ],
+)
+def test_completion(words: str, found: list[str]) -> None:
+    asked = {"_CLEARGS_COMPLETE": "zsh_complete", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    done = subprocess.run(
+        [sys.executable, "-m", "cleargs.cli.entry"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **asked, "COMP_WORDS": words.rpartition(" ")[0] + " " + words.rpartition(" ")[2]},
+    )
+    assert done.stdout.splitlines()[1::3] == found, done.stderr
+
+
+def test_the_script_of_the_completion(shell: Shell) -> None:
+    code, out, _ = shell("completion", "bash")
+    assert code == 0 and "_CLEARGS_COMPLETE=bash_complete" in out and "complete -o nosort" in out
+
+
+def test_printed_commands_run_as_printed(tmp_path: Path) -> None:
+    """Once, the demo ended with a bare ``cleargs``, which no shell found."""
+    (home := tmp_path / "my env" / "bin").mkdir(parents=True)
+    (home / "python").symlink_to(sys.executable)
+    (home / "cleargs").write_text("")
+    code = (
+        "import os; from cleargs.cli.commands import *; name_program(); print(as_called('x cleargs run y'))"
+    )
+    for path, folder, words in (
+        ("/usr/bin", tmp_path, "x 'my env/bin/cleargs' run y"),
+        (f"{home}:/usr/bin", tmp_path, "x cleargs run y"),
+    ):
+        (home / "cleargs").chmod(0o755)
+        run = f"import sys; sys.executable = {str(home / 'python')!r}; {code}"
+        outside = {"PATH": path, "HOME": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
+        done = subprocess.run(
+            [sys.executable, "-c", run], capture_output=True, text=True, env=outside, cwd=folder
+        )
+        assert done.stdout.strip() == words, done.stderr
+
+
+def test_the_users_configuration(shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    (tmp_path / "cleargs").mkdir()
+    file = tmp_path / "cleargs" / "config.toml"
+    file.write_text(f"store = {str(tmp_path / 'shared')!r}\nthreads = 1\n")
+    assert shell.run()[0] == 0
+    assert (tmp_path / "shared" / "count").is_dir() and not shell.bench.store.exists()
+    file.write_text(f"store = {str(tmp_path / 'other')!r}\n")
+    code, out, _ = again(shell)
+    assert code == 0 and "reused: count" in out, "an existing run keeps its store"
+    invoke(["doctor", "--json"])
+    assert str(file) in shell.capsys.readouterr().out
+    for text, words in (("devcie = 'cpu'", "did you mean device?"), ("threads = 0", "'--threads'")):
+        file.write_text(text)
+        code, _, err = again(shell)
+        assert code == 2 and words in err
+
+
+def test_diff(shell: Shell) -> None:
+    shell.run("--set", "square.power=3")
+    other = shell.bench.root / "other"
+    shell("run", str(shell.bench.capture), "-o", str(other), "--recipe", shell.recipe)
+    found = json.loads(shell("diff", str(shell.bench.folder), str(other), "--json")[1])
+    assert found["settings"] == {"square.power": [3, 2]}
+    assert found["figures"].keys() >= {"square: time, s", "all stages: time, s"}
+    code, out, _ = shell("diff", str(shell.bench.folder), str(other))
+    assert code == 0 and "square.power" in out and "all stages: time, s" in out
 
 
 def test_stretch_of_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

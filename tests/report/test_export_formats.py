@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,22 @@ def test_a_program_chooses_format_and_axes(
     assert scene.sh_degree == 3  # Blender and the game engines read no other degree
     ahead, axis = {"blender": (1, 1), "unity": (-1, 2), "unreal": (1, 2)}[program]
     assert float((ahead * scene.means[:, axis]).median()) > 0.5  # the wall is ahead of the first camera
+
+
+def test_a_packed_run_can_be_exported_elsewhere(run: FinishedRun, tmp_path: Path) -> None:
+    assert invoke(["pack", str(run.folder), "-o", str(tmp_path / "room.zip")]) == 0
+    with zipfile.ZipFile(tmp_path / "room.zip") as archive:
+        assert not any("candidates" in name or "/images/" in name for name in archive.namelist())
+        archive.extractall(tmp_path)
+    copy = tmp_path / run.folder.name
+    assert not [path for path in copy.rglob("*") if path.is_symlink()]
+    settings = (copy / "run.toml").read_text()
+    assert str(run.folder.parent) not in settings and "input = " in settings
+    assert invoke(["show", str(copy)]) == 0
+    for where, name in ((run.folder, "here"), (copy, "there")):
+        assert invoke(["export", str(where), "-o", str(tmp_path / f"{name}.ply"), "--up", "z"]) == 0
+    assert (tmp_path / "here.ply").read_bytes() == (tmp_path / "there.ply").read_bytes()
+    assert invoke(["pack", str(run.folder), "-o", str(tmp_path / "room.zip")]) == 2
 
 
 def test_metres(run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
