@@ -174,7 +174,7 @@ def test_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     names: dict[str, object] = {}
     exec(code[0], names)
-    names.update(CAPTURE=place / "room", RUN=place / "run", WORKFLOW=str(place / "tiny.toml"))
+    names.update(CAPTURE=place / "room", RUN=place / "run", RECIPE=str(place / "tiny.toml"))
     for cell in code[1:]:
         exec(cell, names)
     assert isinstance(names["scene"], cg.Scene)

@@ -535,11 +535,17 @@ def test_the_doctor_reports_the_pace(
         assert found == {"what": "pace", "state": "ok", "text": words}
 
 
-def test_other_systems_than_linux_are_refused() -> None:
-    script = "import sys; sys.platform = 'darwin'; from cleargs.cli.entry import main; main()"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    cause, remedy = done.stderr.splitlines()
-    assert done.returncode == 2 and "runs on Linux" in cause and remedy.startswith("hint: ")
+def test_windows_is_refused_and_macos_is_not() -> None:
+    script = (
+        "import sys; sys.platform = {!r}; sys.argv[1:] = ['-V']; from cleargs.cli.entry import main; main()"
+    )
+    windows, macos = (
+        subprocess.run([sys.executable, "-c", script.format(name)], capture_output=True, text=True)
+        for name in ("win32", "darwin")
+    )
+    cause, remedy = windows.stderr.splitlines()
+    assert windows.returncode == 2 and "Windows" in cause and "WSL 2" in remedy
+    assert macos.returncode == 0 and "version" in macos.stdout, macos.stderr
 
 
 @pytest.mark.parametrize(("own", "policy"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
