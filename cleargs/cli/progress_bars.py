@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -15,7 +15,7 @@ import click
 
 from cleargs.cli.commands import as_called
 from cleargs.files import disk_errors
-from cleargs.progress import CountedTask, LineReporter, Reporter, Say, Task
+from cleargs.progress import CountedTask, ForwardingTask, LineReporter, Reporter, Say, Task
 from cleargs.safe_io import printable
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class LoggingReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         with self._shown.task(label, total) as first, self._lines.task(label, total) as second:
-            yield ForwardingTask(total, (first, second))
+            yield ForwardingTask(first, total, lambda done, note, left: second.update(done=done, note=note))
 
     def info(self, text: str) -> None:
         self._shown.info(text)
@@ -86,19 +86,6 @@ class LoggingReporter:
     def warn(self, text: str) -> None:
         self._shown.warn(text)
         self._lines.warn(text)
-
-
-class ForwardingTask(CountedTask):
-    """A task that forwards to others."""
-
-    def __init__(self, total: int | None, tasks: Sequence[Task]) -> None:
-        super().__init__(total, lambda done, note, left: None)
-        self._tasks = tasks
-
-    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
-        super().update(done=done, note=note, share=share)
-        for task in self._tasks:
-            task.update(done=self.done, note=self.note, share=share)
 
 
 class JsonReporter:

@@ -75,24 +75,6 @@ MODELS = {
 }
 """Model of a frame's image formation -> its name."""
 
-SOURCES = {
-    "observation": "the frame as filmed",
-    "deblurred": "the deblurred frame",
-    "render": "the render",
-}
-"""Input of the expert -> its name."""
-
-SCORES = {
-    "R": "reliability",
-    "B": "risk of degradation",
-    "G": "geometric utility",
-    "C": "coverage gain",
-    "D": "pose diversity",
-    "O": "redundancy",
-    "Z": "centrality in its bin",
-}
-"""Score of RVA -> its meaning."""
-
 
 @click.command(
     epilog="""\b
@@ -382,7 +364,7 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
         "picture": str(picture),
     }
     if not as_json:
-        _print_table(_lines(row, facts, run), title=f"frame {number}")
+        _print_table(_lines(row, facts), title=f"frame {number}")
     answer(as_json, facts, f"written: {picture}")
 
 
@@ -417,62 +399,41 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     return shown
 
 
-def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
-    """Yield label and text of each line about a frame."""
+def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield label and text of each line about a frame. ``--json`` has more."""
     from cleargs.report.frames import CHOICES, scores_of
 
     frame, judged = row.frame, facts["rva"]
     yield "file", frame.name
-    yield "image", f"{run / 'ingest' / frame.image}, {frame.width}x{frame.height} px"
     if frame.time_s is not None:
         yield "time", f"{frame.time_s:.2f} s"
     if frame.split == "test":
         yield "held out", "for testing; no training uses it"
-    if not frame.registered:
-        yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
-    else:
+    if frame.registered:
         centre = ", ".join(f"{value:.3f}" for value in facts["centre"])
-        quaternion = ", ".join(f"{facts[name]:.3f}" for name in ("qw", "qx", "qy", "qz"))
-        yield "pose", f"camera at ({centre}), world-to-camera rotation w, x, y, z ({quaternion})"
-        if frame.placed:
-            yield "placed by", frame.placed
-        yield "points", f"sees {frame.n_points} sparse points"
+        yield "pose", f"camera at ({centre}), sees {frame.n_points} sparse points"
+    else:
+        yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
     if judged:
         yield "role", f"{judged['role']}, weight {row.weight:.2f}: {judged['reason']}"
-        known = {name: value for name, value in judged.items() if value is not None}
-        yield (
-            "scores",
-            ", ".join(f"{name} {known[name]:.2f} {SCORES[name]}" for name in SCORES if name in known),
-        )
-        for label, prefix in (("quality, 0 to 1", "r_"), ("faults, 0 to 1", "b_")):
-            cues = (name for name in known if name.startswith(prefix))
-            yield label, ", ".join(f"{name[2:].replace('_', ' ')} {known[name]:.2f}" for name in cues)
+        known = ((name, judged[name]) for name in ("R", "B", "G") if judged[name] is not None)
+        yield "scores", ", ".join(f"{name} {value:.2f}" for name, value in known)
         yield "worst cue", judged["worst_cue"] or "none"
-    if row.gain_ev is not None:
-        yield "exposure", f"{row.gain_ev:+.2f} stops relative to the scene"
     if found := row.formation:
         model = MODELS.get(found["model"], found["model"])
         if found["model"] == "none":
             yield "formation", model
         else:
-            share = f"{100 * found['explained']:.0f} %"
-            yield "formation", f"{model}, explains {share} of the misfit"
             lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
-            yield "", ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
-        yield (
-            "weight",
-            f"{found['weight_before']:.2f} before image formation, {found['weight_after']:.2f} after it",
-        )
+            sizes = ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
+            yield "formation", f"{model}, explains {100 * found['explained']:.0f} % of the misfit; {sizes}"
+        before, after = found["weight_before"], found["weight_after"]
+        yield "weight", f"{before:.2f} before image formation, {after:.2f} after it"
     for choice in row.rounds:
         refused = ", refused" if not choice.accepted and choice.chosen != "observed" else ""
         yield f"round {choice.round}", f"{CHOICES[choice.chosen]}{refused} ({choice.reason})"
         for metric, scores in scores_of(choice):
             yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
-        if choice.restored_from is None:
-            continue
-        moved = choice.blur_px is not None
-        motion = f": blur {choice.blur_px:.1f} px, skew {choice.skew_px:.1f} px" if moved else ""
-        yield "", f"restored from {SOURCES[choice.restored_from]}{motion}"
     if repair := facts["distilled"]:
         yield "final scene", f"trained on {CHOICES[repair['chosen']]} of round {repair['round']}"
 

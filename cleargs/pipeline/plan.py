@@ -110,7 +110,7 @@ class Planner:
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
             device=self.run.device_of(name),
-            libraries=library_versions(stage, self.run.device_of(name)) | plugin_versions(config),
+            libraries=library_versions(stage, self.run.device_of(name), config) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited: dict[str, None] = {}  # an ordered set
