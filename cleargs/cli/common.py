@@ -87,16 +87,12 @@ partial_option = click.option(
 run_argument = click.argument("run", type=FOLDER)
 
 
-def _keep_verbose(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    context.meta[VERBOSE] = value
-
-
 verbose_option = click.option(
     "-v",
     "--verbose",
     is_flag=True,
     expose_value=False,
-    callback=_keep_verbose,
+    callback=lambda context, parameter, value: context.meta.update({VERBOSE: value}),
     help="Also print device, store, and cost of each stage.",
 )
 
@@ -189,12 +185,6 @@ def output_option(
 ) -> Callable[[F], F]:
     """Return the option ``-o`` of a command that fills a folder."""
     return click.option("-o", "--output", name, metavar=metavar, required=required, type=FOLDER, help=help)
-
-
-def file_option(help: str) -> Callable[[F], F]:
-    """Return the option ``-o`` of a command that writes a file; ``help`` lists the endings of the formats."""
-    help = f"The new file. Its ending chooses the format: {help}"
-    return click.option("-o", "--output", required=True, type=FILE, help=help)
 
 
 def report_option(help: str) -> Callable[[F], F]:

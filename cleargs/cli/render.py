@@ -8,8 +8,8 @@ from typing import Any
 import click
 
 from cleargs.cli.common import (
+    FILE,
     answer,
-    file_option,
     json_option,
     parse_size,
     quiet_option,
@@ -90,7 +90,7 @@ renders a picture for each pose.
     show_default=True,
     help="Codec of a film: h264 plays everywhere, av1 takes less space.",
 )
-@file_option(".mp4 .png .exr")
+@click.option("-o", "--output", required=True, type=FILE, help="The new file: .mp4, .png or .exr.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @work_options
 @json_option

@@ -278,7 +278,7 @@ def test_novel_views_are_aligned_by_the_observed_ones(shell: Shell, tmp_path: Pa
 
 def test_a_figure_below_its_limit_fails(shell: Shell, run: Path, truth: Path) -> None:
     given = (run, "--reference", truth, *FAST, "--fail-below")
-    code, out, _ = shell(*given, "psnr=20")
+    code, out, _ = shell(*given, "psnr=1")
     assert code == 0 and "PSNR" in out
     code, out, err = shell(*given, "psnr=200", "--fail-below", "ssim=0")
     assert code == 1 and "PSNR" in out and "below the limit: rivr: psnr" in err and "ssim" not in err
