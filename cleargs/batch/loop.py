@@ -32,7 +32,7 @@ from cleargs.pipeline.run_file import SCENE, Device, RunMetadata, RunSpec, read_
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
-from cleargs.render import PROGRAMS
+from cleargs.render import TARGETS
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
 from cleargs.subprocesses import module_command
@@ -123,7 +123,7 @@ class Batch:
                     check_same_input(run, self.dag, store)
                 for stage in self.dag.until(self.until)[1:]:  # the first one's files are the capture
                     self.dag.load(stage).externals(run.config.effective[stage], run.source)
-                for ending in set(scene.after.export) - set(PROGRAMS):
+                for ending in set(scene.after.export) - set(TARGETS):
                     from cleargs.splat.formats import format_of  # loads torch
 
                     format_of(Path(f"{scene.name}.{ending}"))
@@ -153,7 +153,7 @@ class Batch:
         made = run / SCENE
         wanted = [
             (f"{name}.{kind}", ["export", str(run), "-o", f"{name}.{kind}", "--force"])
-            if kind not in PROGRAMS
+            if kind not in TARGETS
             else (f"{name}-{kind}.*", ["export", str(run), "--for", kind, "--force"])
             for kind in after.export
         ]

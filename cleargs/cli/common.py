@@ -16,6 +16,7 @@ from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import recipe_names
 from cleargs.pipeline.dag import installed
+from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.session import usable_cores
 from cleargs.pipeline.settings import settings_of
 from cleargs.progress import Say
@@ -104,7 +105,7 @@ def kept_log(context: click.Context, path: Path, *, writes: bool) -> Iterator[Sa
     Yields a function for details, which are shown only with ``-v``.
     """
     chosen: Say | None = context.meta.get(LOG)
-    file = LineFile(path)
+    file = LineFile(path, beside=RUN_FILE)  # nothing is written into a folder that is not a run
 
     def log(text: str) -> None:
         if chosen is not None:

@@ -11,7 +11,7 @@ from cleargs.cli.common import FILE, answer, json_option, quiet_option, run_argu
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
-from cleargs.render import PROGRAMS
+from cleargs.render import TARGETS
 from cleargs.run_results import scene_stage
 
 
@@ -35,12 +35,8 @@ Formats:
 
 \b
 Programs of --for:
-  blender      .ply, z up, harmonics of degree 3
-  unreal       .ply, axes as trained, harmonics of degree 3: plug-ins turn the axes themselves
-  unity        .ply, y up, harmonics of degree 3; in UnityGaussianSplatting set Scale to 1, 1, -1
-  supersplat   .sog, axes as trained
-  web          .spz, y up
 """
+    + "\n".join(f"  {name:<12} .{target.ending}, {target.hint}" for name, target in TARGETS.items())
 )
 @run_argument
 @click.option(
@@ -83,7 +79,7 @@ Programs of --for:
 @click.option(
     "--for",
     "program",
-    type=click.Choice(PROGRAMS),
+    type=click.Choice(list(TARGETS)),
     help="Choose format, axes and degree of the harmonics for this program.",
 )
 @click.option(
@@ -118,7 +114,7 @@ def export(
     **options: Any,
 ) -> None:
     """Write the scene of RUN to one or several files."""
-    from cleargs.render.export import TARGETS, ExportOptions, export_scene
+    from cleargs.render.export import ExportOptions, export_scene
 
     target = TARGETS[program] if program is not None else None
     if target is not None:

@@ -55,14 +55,14 @@ def make_reporter(quiet: bool = False) -> Reporter:
 
 
 class LineFile:
-    """A text file that grows by lines with the time. It is opened as soon as its folder exists."""
+    """A text file that grows by lines with the time. Lines wait until the file ``beside`` it exists."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._waiting = path, [""]
+    def __init__(self, path: Path, beside: str = ".") -> None:
+        self.path, self._beside, self._waiting = path, path.parent / beside, [""]
 
     def __call__(self, text: str) -> None:
         self._waiting.append(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}")
-        if self.path.parent.is_dir():
+        if self._beside.exists():
             with disk_errors(self.path), self.path.open("a", encoding="utf-8") as file:
                 file.writelines(f"{line}\n" for line in self._waiting)
             self._waiting.clear()

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-DEFAULTS: Mapping[str, frozenset[str] | None] = {
-    "store": frozenset({"run", "demo"}),
-    "device": frozenset({"run", "demo", "batch", "render"}),
-    "threads": None,
-    "quality": frozenset({"run", "demo", "batch"}),
-}
-"""Entry of the file -> the commands whose option it sets; None for all. Other commands follow the run."""
+DEFAULTS = ("store", "device", "threads", "quality")
+"""Entries of the file. All but ``threads`` are for new runs only: other commands follow the run."""
 
 
 def user_config_file() -> Path:
@@ -42,7 +37,5 @@ def user_defaults(commands: Iterable[str]) -> dict[str, dict[str, Any]]:
             )
     if "store" in found:
         found["store"] = str(Path(str(found["store"])).expanduser())
-    return {
-        command: {name: value for name, value in found.items() if command in (DEFAULTS[name] or (command,))}
-        for command in commands
-    }
+    threads = {name: value for name, value in found.items() if name == "threads"}
+    return {**dict.fromkeys(commands, threads), "run": found, "demo": found}

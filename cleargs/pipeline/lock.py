@@ -14,11 +14,6 @@ from pathlib import Path
 from cleargs.files import disk_errors
 from cleargs.progress import Reporter
 
-try:
-    import fcntl
-except ImportError:  # a Python without it: as on a file system without locks
-    fcntl = None  # type: ignore[assignment]
-
 
 @contextmanager
 def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterator[bool | None]:
@@ -88,7 +83,9 @@ def is_locked(path: Path) -> bool:
 
 
 def _acquire(handle: int, *, shared: bool, wait: bool) -> bool | None:
-    if fcntl is None:
+    try:
+        import fcntl
+    except ImportError:  # a Python without it: as on a file system without locks
         return None
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:

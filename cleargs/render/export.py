@@ -31,27 +31,6 @@ MODEL = "colmap/sparse/0"
 
 
 @dataclass(frozen=True)
-class Target:
-    """The file that a program reads best."""
-
-    ending: str
-    up: str | None = None
-    sh_degree: int | None = None
-    hint: str = ""
-    """The steps that are left to the user."""
-
-
-TARGETS: Mapping[str, Target] = {
-    "blender": Target("ply", up="z", sh_degree=3, hint="import it with a 3DGS add-on, without a rotation"),
-    "unreal": Target("ply", sh_degree=3, hint="import it with a 3DGS plug-in, which turns the axes itself"),
-    "unity": Target("ply", up="y", sh_degree=3, hint="UnityGaussianSplatting: set Scale to 1, 1, -1"),
-    "supersplat": Target("sog", hint="drop the file on superspl.at/editor"),
-    "web": Target("spz", up="y", hint="Spark and three.js: add it to the scene without a rotation"),
-}
-"""Program -> its file. Readers of PLY files for game engines and Blender expect harmonics of degree 3."""
-
-
-@dataclass(frozen=True)
 class ExportOptions:
     """Choices of `export_scene`; see ``cleargs export --help``."""
 

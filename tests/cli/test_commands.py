@@ -536,7 +536,8 @@ def test_the_doctor_reports_the_pace(
 
 def test_windows_is_refused_and_macos_is_not() -> None:
     script = (
-        "import sys; sys.platform = {!r}; sys.argv[1:] = ['-V']; from cleargs.cli.entry import main; main()"
+        "import sys, pydantic, cleargs.cli.main; from cleargs.cli.entry import main\n"
+        "sys.platform = {!r}; sys.argv[1:] = ['-V']; main()"
     )
     windows, macos = (
         subprocess.run([sys.executable, "-c", script.format(name)], capture_output=True, text=True)
@@ -619,6 +620,7 @@ def test_a_run_by_the_name_of_its_input_alone(shell: Shell, monkeypatch: pytest.
     code, out, _ = shell("run", str(shell.bench.capture), "--recipe", shell.recipe)
     folder = shell.bench.capture.with_name(f"{shell.bench.capture.name}-scene")
     assert code == 0 and out.startswith(f"results: {folder}/total")
+    assert shell("run", str(shell.bench.capture), "-o", str(shell.bench.capture))[0] == 2
     assert sorted(shell.bench.capture.iterdir()) == before, "nothing is written into the input"
 
 
