@@ -4,7 +4,6 @@ from cleargs.api import export as export
 from cleargs.api import film as film
 from cleargs.api import initialise as initialise
 from cleargs.api import load as load
-from cleargs.api import make_capture as make_capture
 from cleargs.api import render_view as render_view
 from cleargs.api import restore as restore
 from cleargs.api import run as run
@@ -24,6 +23,7 @@ from cleargs.splat.config import TrainConfig as TrainConfig
 from cleargs.splat.gaussians import Gaussians as Gaussians
 from cleargs.splat.scene import Scene as Scene
 from cleargs.splat.views import TrainingView as TrainingView
+from cleargs.synth.synthetic_capture import make_capture as make_capture
 
 # An installed package has cleargs.stages. In a checkout it is the folder stages/, which mypy does not search.
 from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]

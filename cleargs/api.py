@@ -319,39 +319,6 @@ def write_report(run: Run, *, threads: int | None = None) -> Path:
         return write_report(Planner(dag, spec, opened, threads or usable_cores(), log_reporter()))
 
 
-def make_capture(
-    folder: str | Path,
-    protocol: str = "mixed",
-    *,
-    frames: int = 16,
-    size: tuple[int, int] = (480, 270),
-    seed: int = 0,
-    video: bool = False,
-) -> dict[str, Any]:
-    """Make a synthetic capture with known ground truth in a new folder, as ``cleargs synth`` does.
-
-    Returns:
-        The figures of the capture, for example its true blur.
-
-    Example:
-        cg.make_capture("small", "gs2e-medium", frames=4, size=(96, 64))
-    """
-    from cleargs.synth.synthetic_capture import make_capture
-
-    width, height = size
-    reporter = log_reporter()
-    return make_capture(
-        Path(folder),
-        protocol,
-        frames=frames,
-        width=width,
-        height=height,
-        seed=seed,
-        video=video,
-        reporter=reporter,
-    )
-
-
 def score_frames(
     paths: Sequence[str | Path],
     *,

@@ -62,37 +62,25 @@ class ShotOptions:
 
     def check(self, output: Path) -> None:
         """Raise InputError if the options contradict each other, or ``output``."""
-        ending, still = output.suffix.lower(), self.frame is not None
-        for wrong, message, remedy in (
+        ending, still, posed = output.suffix.lower(), self.frame is not None, self.poses is not None
+        for wrong, message, hint in (
+            (still + self.turntable + posed > 1, "--frame, --turntable, --poses: one too many", "give one of them"),
+            (still and ending == ".mp4", "--frame is a still", "end --output with .png or .exr"),
+            (self.world and not posed, "--world needs --poses", "give --poses, or omit --world"),
             (
-                still + self.turntable + (self.poses is not None) > 1,
-                "--frame, --turntable and --poses exclude each other",
-                "give one of them",
-            ),
-            (
-                still and ending == ".mp4",
-                "--frame is a still, not a film",
-                "end --output with .png or .exr, or omit --frame",
-            ),
-            (self.world and self.poses is None, "--world needs --poses", "give --poses, or omit --world"),
-            (
-                self.seconds is not None and (self.poses is not None or still),
+                self.seconds is not None and (posed or still),
                 "--seconds is the length of the path or the turntable",
                 "omit it; --fps sets the speed of --poses",
             ),
             (
-                self.side_by_side and (self.turntable or self.poses is not None),
-                "--side-by-side needs frames of the capture, which --turntable and --poses do not follow",
-                "omit them to follow the path, or give --frame",
+                self.side_by_side and (self.turntable or posed),
+                "--side-by-side needs frames of the capture",
+                "omit --turntable and --poses to follow the path, or give --frame",
             ),
-            (
-                self.side_by_side and ending == ".exr",
-                "--side-by-side is only for films and PNGs",
-                "end --output with .mp4 or .png",
-            ),
+            (self.side_by_side and ending == ".exr", "--side-by-side is for films and PNGs", "omit it"),
         ):
             if wrong:
-                raise InputError(message, hint=remedy)
+                raise InputError(message, hint=hint)
 
 
 def render_run(
