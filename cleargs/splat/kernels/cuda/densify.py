@@ -17,11 +17,10 @@ from torch import Tensor
 
 from cleargs.splat import densification
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.projection import dot, rotation_columns
 from cleargs.splat.transforms import rotation_matrices
 from cleargs.splat.types import Moments
-
-BLOCK = 256
 
 
 def seed_of(numbers: Sequence[int]) -> int:
@@ -101,11 +100,9 @@ def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: flo
 
 
 @triton.jit(do_not_specialize=["n", "seed"])
-def position_noise_kernel(
-    means, log_scales, rotations, logits, n, seed, amount, min_opacity, cut, BLOCK: tl.constexpr
-):
+def position_noise_kernel(means, log_scales, rotations, logits, n, seed, amount, min_opacity, cut):
     """Add ``amount`` * covariance * a normal draw to the means, less above ``min_opacity``."""
-    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    g = tl.program_id(0) * device_layout.NOISE_BLOCK + tl.arange(0, device_layout.NOISE_BLOCK)
     mask = g < n
     opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + g, mask=mask, other=0.0)))
     felt = mask & (opacity < cut)
@@ -132,7 +129,7 @@ def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
     """Add the noise of one step to the means of Gaussians below ``densification.NOISE_CUT``, in place."""
-    position_noise_kernel[(-(-gaussians.num // BLOCK),)](
+    position_noise_kernel[(-(-gaussians.num // device_layout.NOISE_BLOCK),)](
         gaussians.means,
         gaussians.log_scales,
         gaussians.rotations,
@@ -142,6 +139,5 @@ def add_position_noise(
         amount,
         min_opacity,
         densification.NOISE_CUT,
-        BLOCK=BLOCK,
         num_warps=4,
     )

@@ -1,8 +1,7 @@
 """Compare the GPU's kernels with the CPU's on this machine.
 
 ``cleargs.gpu`` runs this module in a child process and reads its lines of JSON from stdout. Every check runs
-twice on the GPU and once on the CPU. The results of the GPU must agree with the CPU's within the tolerances
-of ``tests/gpu``, and must be the same bits in both runs.
+twice on the GPU, with the same bits, and once on the CPU, within the tolerances of ``tests/gpu``.
 """
 
 from __future__ import annotations
@@ -260,10 +259,7 @@ def allocated(device: torch.device) -> int:
 
 
 def iterate(view: View, repeats: int, backend: Backend, device: torch.device) -> tuple[float, int]:
-    """Return the milliseconds of the fastest training step, and the growth of the memory in bytes.
-
-    The first three steps compile kernels and fill buffers: they do not count.
-    """
+    """Return the milliseconds of the fastest training step after three, and the growth of memory in bytes."""
     gaussians, camera = view.scene(device)
     target = _random(view.height, view.width, 3, device=device)
     slope, moments, engine = torch.empty_like(target), Moments.zeros(gaussians), backend.rasteriser(device)
@@ -282,10 +278,7 @@ def iterate(view: View, repeats: int, backend: Backend, device: torch.device) ->
 
 
 def main(device: str = "cuda", sizes: Sizes = FULL) -> None:
-    """Run all checks; print a line before and after each.
-
-    An exception ends the test: a GPU may answer nothing after it.
-    """
+    """Run all checks; print a line before and after each. An exception ends the test: the GPU may be dead."""
 
     def say(**facts: Any) -> None:
         print(json.dumps(facts), flush=True)
