@@ -37,8 +37,7 @@ class OnnxExpert:
     """A restoration network in an ONNX file, applied to overlapping tiles (on a GPU in batches).
 
     The network maps an image [1, 3, H, W] or [1, H, W, 3], float32 sRGB in [0, 1], to an image of the same
-    size in either layout. Its first output is used. If it has a fixed input size, that is the size of the
-    tiles.
+    size in either layout. Its first output is used. A fixed input size is the size of the tiles.
 
     Args:
         path: ONNX file.
@@ -94,14 +93,9 @@ class OnnxExpert:
 
 
 def load_expert(spec: str, device: Device = "cpu") -> Expert:
-    """Load the expert that a setting names.
+    """Load the expert that ``rivr.expert`` names: a model of the registry, an ONNX file, or a plugin.
 
-    Args:
-        spec: Value of the setting ``rivr.expert``: a model of the registry, an ONNX file, or a part.
-        device: Device of the network, as `network_device` returns it.
-
-    Raises:
-        InputError: The expert is unknown, not installed or unusable.
+    Raises InputError if it is unknown, not installed or unusable.
     """
 
     def from_file(path: Path, model: RegistryEntry | None) -> Expert:

@@ -63,14 +63,9 @@ def runtime_version(device: Device) -> str:
 
 
 def network_device(device: Device, warn: Callable[[str], None]) -> Device:
-    """Return the device on which onnxruntime can run networks, which a trial determines.
+    """Return ``cuda`` if a run on ``device`` can run networks there, which a trial determines, else ``cpu``.
 
-    Args:
-        device: Device of the run.
-        warn: Function that receives a warning if the run uses a GPU but onnxruntime cannot.
-
-    Returns:
-        ``cuda`` if ``device`` is ``cuda`` and onnxruntime's CUDA provider is present and loads, else ``cpu``.
+    ``warn`` receives a warning if the run uses a GPU but onnxruntime cannot.
     """
     if device == "cpu":
         return "cpu"
@@ -101,11 +96,8 @@ class TensorInfo:
 class OnnxModel:
     """An ONNX file, loaded by onnxruntime. It runs on the CPU if the GPU's provider does not load.
 
-    The file must contain all weights, because the digest does not cover other files.
-
-    Args:
-        path: ONNX file.
-        device: Device to run on, as `network_device` returns it.
+    The file must contain all weights, because the digest does not cover other files. ``device`` is a result
+    of `network_device`.
 
     Raises:
         InputError: The file is missing, refers to other files, or is not a model that onnxruntime can run.
@@ -179,12 +171,10 @@ class OnnxModel:
         items: Sequence[NDArray[np.float32]],
         threads: int,
     ) -> Iterator[Any]:
-        """Apply ``function`` to all items, and yield the results in their order.
+        """Apply ``function`` to all items [H, W, C] of one size, and yield the results in their order.
 
-        Args:
-            function: Function that maps a batch [N, H, W, C] to results [N, ...] with one call of `run`.
-            items: Arrays [H, W, C] of the same size.
-            threads: Number of items at the same time on the CPU. On a GPU a batch is as large as fits.
+        ``function`` maps a batch [N, H, W, C] to results [N, ...] with one call of `run`. On the CPU
+        ``threads`` items are processed at the same time, on a GPU as many as fit.
         """
         if self.takes_batches:
             yield from in_batches(function, items)
@@ -196,12 +186,10 @@ class OnnxModel:
 def in_batches(
     function: Callable[[NDArray[np.float32]], NDArray[np.float32]], items: Sequence[NDArray[np.float32]]
 ) -> list[Any]:
-    """Return the results of ``function`` for ``items`` [H, W, ...] of the same size, computed in batches.
+    """Return the results of ``function`` for ``items`` [H, W, ...] of one size, computed in batches.
 
-    If a batch does not fit into the GPU's memory, the batch size is halved.
-
-    Raises:
-        StageError: A single item is too large.
+    The batch size is halved if a batch does not fit into the GPU's memory. StageError is raised if one item
+    does not.
     """
     pixels = items[0].shape[0] * items[0].shape[1]
     size = max(1, BATCH_PIXELS // pixels)

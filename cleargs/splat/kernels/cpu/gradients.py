@@ -206,7 +206,7 @@ def backpropagate(
     """Write the gradients of the five parameters, from the pair sums of the rasteriser's backward pass.
 
     The rows ``pair_offsets[g]`` to ``pair_offsets[g + 1]`` of ``pair_sums`` belong to Gaussian ``g``. They
-    are added in order and in float64, so there are no races and the result does not depend on the threads.
+    are added in order and in float64.
     """
     n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
