@@ -50,17 +50,14 @@ class OnnxExpert:
 
     def __init__(self, path: Path, name: str | None = None, device: Device = "cpu") -> None:
         model = OnnxModel(path, device)
-        shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
+        shape = model.inputs[0] if len(model.inputs) == 1 else ()
         if len(shape) != 4 or shape[0] not in (None, 1) or 3 not in (shape[1], shape[3]):
             raise InputError(
-                f"{path} does not take one RGB image: its inputs are {[info.shape for info in model.inputs]}",
+                f"{path} does not take one RGB image: its inputs are {model.inputs}",
                 hint="use a restoration model that takes [1, 3, H, W] or [1, H, W, 3]",
             )
-        if model.inputs[0].dtype != "float":
-            raise InputError(
-                f"{path} takes {model.inputs[0].dtype} values, not float32",
-                hint="export the model in float32",
-            )
+        if not model.takes_floats:
+            raise InputError(f"{path} does not take float32 values", hint="export the model in float32")
         self._model = model
         self._channels_first = shape[1] == 3
         self._fixed = (shape[2], shape[3]) if self._channels_first else (shape[1], shape[2])

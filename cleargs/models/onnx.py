@@ -11,7 +11,6 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from io import StringIO
@@ -84,15 +83,6 @@ def network_device(device: Device, warn: Callable[[str], None]) -> Device:
     return "cuda"
 
 
-@dataclass(frozen=True)
-class TensorInfo:
-    """An input or output of a model."""
-
-    name: str
-    shape: tuple[int | None, ...]  # None: free
-    dtype: str  # element type: ``float``, ``float16``...
-
-
 class OnnxModel:
     """An ONNX file, loaded by onnxruntime. It runs on the CPU if the GPU's provider does not load.
 
@@ -138,14 +128,19 @@ class OnnxModel:
         self.digest = hashlib.sha256(model).hexdigest()
         """SHA-256 of the file, hexadecimal."""
         self.device: Device = "cuda" if CUDA_PROVIDER in session.get_providers() else "cpu"
-        self.inputs = _describe(session.get_inputs())
-        self.outputs = _describe(session.get_outputs())
         self._session: Any = session
+        self._inputs = session.get_inputs()
+        self.inputs, self.outputs = (
+            [tuple(side if isinstance(side, int) else None for side in argument.shape) for argument in those]
+            for those in (self._inputs, session.get_outputs())
+        )
+        """Shapes; None: free."""
+        self.takes_floats = all(argument.type == "tensor(float)" for argument in self._inputs)
 
     @property
     def takes_batches(self) -> bool:
         """True if `map` runs several items per call: on a GPU, if the first axis of all inputs is free."""
-        return self.device == "cuda" and all(info.shape[:1] == (None,) for info in self.inputs)
+        return self.device == "cuda" and all(shape[:1] == (None,) for shape in self.inputs)
 
     def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
         """Return all outputs for the given inputs, both in the model's order. The method is thread-safe.
@@ -154,7 +149,7 @@ class OnnxModel:
             MemoryError: The computation does not fit into memory.
             StageError: onnxruntime failed for another reason.
         """
-        feeds = {info.name: tensor for info, tensor in zip(self.inputs, tensors, strict=True)}
+        feeds = {info.name: tensor for info, tensor in zip(self._inputs, tensors, strict=True)}
         try:
             outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
         except Exception as error:  # onnxruntime's exceptions have no common base class
@@ -216,14 +211,3 @@ def _raise_exhausted(path: Path, error: Exception) -> None:
 
 def _reason(error: Exception) -> str:
     return (str(error).strip() or "no reason was given").splitlines()[0]
-
-
-def _describe(arguments: Sequence[Any]) -> tuple[TensorInfo, ...]:
-    return tuple(
-        TensorInfo(
-            name=argument.name,
-            shape=tuple(extent if isinstance(extent, int) else None for extent in argument.shape),
-            dtype=argument.type.removeprefix("tensor(").removesuffix(")"),
-        )
-        for argument in arguments
-    )

@@ -122,12 +122,12 @@ class LearnedScorer:
         self, path: Path, name: str | None = None, tile: int | None = None, device: Device = "cpu"
     ) -> None:
         model = OnnxModel(path, device)
-        shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
+        shape = model.inputs[0] if len(model.inputs) == 1 else ()
         takes_images = len(shape) == 4 and shape[0] in (None, 1) and shape[1] == 3
-        if not takes_images or len(model.outputs[0].shape) > 2:
+        if not takes_images or len(model.outputs[0]) > 2:
             raise InputError(
                 f"{path} does not map an RGB image to one score: "
-                f"it takes {[i.shape for i in model.inputs]} and returns {[o.shape for o in model.outputs]}",
+                f"it takes {model.inputs} and returns {model.outputs}",
                 hint="use a scoring model that takes [N, 3, H, W] and returns one score per image",
             )
         self.name = name or path.stem
@@ -155,9 +155,9 @@ class MusiqScorer:
 
     def __init__(self, path: Path, device: Device = "cpu") -> None:
         model = OnnxModel(path, device)
-        if [len(info.shape) for info in model.inputs] != [4, 1, 1]:
+        if [len(shape) for shape in model.inputs] != [4, 1, 1]:
             raise InputError(
-                f"{path} is not MUSIQ: its inputs are {[info.shape for info in model.inputs]}",
+                f"{path} is not MUSIQ: its inputs are {model.inputs}",
                 hint=f"{find_model('musiq').install_hint} again",
             )
         self.digest = model.digest

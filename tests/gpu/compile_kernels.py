@@ -20,7 +20,6 @@ from triton.compiler import ASTSource
 
 from cleargs.splat.kernels.cuda import (
     binning,
-    densify,
     elementwise,
     frame_warp,
     gradients,
@@ -52,12 +51,6 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             {"num_warps": 1, **UNFUSED},
         ),
         (
-            binning.order_pairs,
-            {"sorted_slots": I64, "pair_owners": I32, "pair_ids": I32, "pair_slots": I32, "pairs": "i32"},
-            {},
-            {},
-        ),
-        (
             gradients.total,
             {"tile_counts": I32, "pair_starts": I32, "pair_sums": F32, "totals": F64, "n": "i32"},
             {"COLUMNS": 9},
@@ -69,25 +62,6 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                 **dict.fromkeys(("parameter", "gradient", "first", "second", "rates"), F32),
                 **{"size": "i32", "columns": "i32"},
                 **dict.fromkeys(("beta1", "beta2", "epsilon", "correction", "root_correction"), "fp32"),
-            },
-            {},
-            {},
-        ),
-        (elementwise.map_pixels, {"image": F32, "affine": F32, "output": F32, "pixels": "i32"}, {}, {}),
-        (
-            elementwise.map_backward,
-            {
-                **dict.fromkeys(("image", "affine", "grad_output", "grad_image"), F32),
-                **{"partials": F64, "pixels": "i32"},
-            },
-            {},
-            {},
-        ),
-        (
-            densify.position_noise_kernel,
-            {
-                **{name: kind for name, kind in SCENE.items() if name != "sh"},
-                **{"n": "i32", "seed": "i64", "amount": "fp32", "min_opacity": "fp32", "cut": "fp32"},
             },
             {},
             {},

@@ -130,18 +130,6 @@ def list_pairs(splats, order, tile_counts, pair_ends, pair_starts, pair_tiles, p
         slot += length
 
 
-@triton.jit(do_not_specialize=["pairs"])
-def order_pairs(sorted_slots, pair_owners, pair_ids, pair_slots, pairs):
-    """Store the Gaussian and the slot (both int32) of every place, from torch's int64 order of the slots."""
-    place = tl.program_id(0).to(tl.int64) * device_layout.ORDER_BLOCK + tl.arange(
-        0, device_layout.ORDER_BLOCK
-    )
-    mask = place < pairs
-    slot = tl.load(sorted_slots + place, mask=mask, other=0)
-    tl.store(pair_ids + place, tl.load(pair_owners + slot, mask=mask, other=0), mask=mask)
-    tl.store(pair_slots + place, slot.to(tl.int32), mask=mask)
-
-
 def tile_starts(sorted_tiles: Tensor, tiles: int) -> Tensor:
     """Return the first place of every tile, and the end: [tiles + 1] int32."""
     numbers = torch.arange(tiles + 1, dtype=sorted_tiles.dtype, device=sorted_tiles.device)

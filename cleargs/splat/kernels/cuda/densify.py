@@ -1,7 +1,6 @@
 """Refinement and noise of 3DGS-MCMC on the GPU, by the rules of ``cleargs.splat.densification``.
 
-A refinement is rare and consists of torch operations. The noise of every step is one kernel. Random numbers
-come from Philox counters whose key is the step's seed, so that one device draws the same numbers each time.
+Random numbers come from torch's generator with the step's seed: one device draws the same numbers each time.
 """
 
 from __future__ import annotations
@@ -11,14 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-import triton
-import triton.language as tl
 from torch import Tensor
 
 from cleargs.splat import densification
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cuda import device_layout
-from cleargs.splat.kernels.cuda.projection import dot, rotation_columns
 from cleargs.splat.transforms import rotation_matrices
 from cleargs.splat.types import Moments
 
@@ -99,45 +94,15 @@ def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: flo
     return others
 
 
-@triton.jit(do_not_specialize=["n", "seed"])
-def position_noise_kernel(means, log_scales, rotations, logits, n, seed, amount, min_opacity, cut):
-    """Add ``amount`` * covariance * a normal draw to the means, less above ``min_opacity``."""
-    g = tl.program_id(0) * device_layout.NOISE_BLOCK + tl.arange(0, device_layout.NOISE_BLOCK)
-    mask = g < n
-    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + g, mask=mask, other=0.0)))
-    felt = mask & (opacity < cut)
-    fade = amount / (1.0 + tl.exp(100.0 * (opacity - min_opacity)))
-    n0, n1, n2, _ = tl.randn4x(seed, g)
-    draw = (n0, n1, n2)
-    w = tl.load(rotations + g * 4, mask=felt, other=1.0)
-    x = tl.load(rotations + g * 4 + 1, mask=felt, other=0.0)
-    y = tl.load(rotations + g * 4 + 2, mask=felt, other=0.0)
-    z = tl.load(rotations + g * 4 + 3, mask=felt, other=0.0)
-    inverse = 1.0 / tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    columns = rotation_columns((w * inverse, x * inverse, y * inverse, z * inverse))
-    # S² Rᵀ draw, in the Gaussian's own axes
-    local0 = dot(columns[0], draw) * tl.exp(2.0 * tl.load(log_scales + g * 3, mask=felt, other=0.0))
-    local1 = dot(columns[1], draw) * tl.exp(2.0 * tl.load(log_scales + g * 3 + 1, mask=felt, other=0.0))
-    local2 = dot(columns[2], draw) * tl.exp(2.0 * tl.load(log_scales + g * 3 + 2, mask=felt, other=0.0))
-    for axis in tl.static_range(3):
-        offset = columns[0][axis] * local0 + columns[1][axis] * local1 + columns[2][axis] * local2
-        value = tl.load(means + g * 3 + axis, mask=felt, other=0.0)
-        tl.store(means + g * 3 + axis, value + offset * fade, mask=felt)
-
-
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
     """Add the noise of one step to the means of Gaussians below ``densification.NOISE_CUT``, in place."""
-    position_noise_kernel[(-(-gaussians.num // device_layout.NOISE_BLOCK),)](
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.rotations,
-        gaussians.logit_opacities,
-        gaussians.num,
-        seed_of(seed),
-        amount,
-        min_opacity,
-        densification.NOISE_CUT,
-        num_warps=4,
-    )
+    generator = torch.Generator(gaussians.device).manual_seed(seed_of(seed))
+    opacity = gaussians.logit_opacities.sigmoid()
+    fade = amount / (1.0 + (100.0 * (opacity - min_opacity)).exp())
+    fade = torch.where(opacity < densification.NOISE_CUT, fade, 0.0)
+    axes = rotation_matrices(gaussians.rotations)
+    draw = torch.randn(gaussians.num, 3, generator=generator, device=gaussians.device)
+    local = (axes * draw[:, :, None]).sum(dim=1) * (2.0 * gaussians.log_scales).exp()  # S² Rᵀ draw
+    gaussians.means += fade[:, None] * (axes * local[:, None, :]).sum(dim=2)

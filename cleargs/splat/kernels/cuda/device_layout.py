@@ -20,9 +20,7 @@ CHUNK = 64
 # Work of one program: numbers (Adam), pixels (colour), Gaussians or pairs.
 NUMBERS_BLOCK = 1024
 PROJECT_BLOCK = 128
-NOISE_BLOCK = 256
 LIST_BLOCK = 32
-ORDER_BLOCK = 1024
 TOTAL_ROWS, TOTAL_BLOCK = 16, 16  # Gaussians, and pairs of each at a time
 LOSS_ROWS, LOSS_COLUMNS = 4, 128  # rows of an image, and values in each
 

@@ -16,7 +16,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import rasteriser
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cuda import binning, device_layout, gradients, projection, rasterise
-from cleargs.splat.kernels.cuda.device_layout import LIST_BLOCK, ORDER_BLOCK, PROJECT_BLOCK, TOTAL_ROWS
+from cleargs.splat.kernels.cuda.device_layout import LIST_BLOCK, PROJECT_BLOCK, TOTAL_ROWS
 from cleargs.splat.kernels.cuda.support import memory_errors
 from cleargs.splat.kernels.rasteriser import tiles_of
 from cleargs.splat.types import Render
@@ -220,10 +220,8 @@ class CudaRasteriser(rasteriser.Rasteriser):
                 enable_fp_fusion=False,
             )
         sorted_tiles, sorted_slots = torch.sort(pair_tiles, stable=True)
-        if pairs:
-            binning.order_pairs[(-(-pairs // ORDER_BLOCK),)](
-                sorted_slots, pair_owners, pair_ids, pair_slots, pairs, num_warps=4
-            )
+        torch.index_select(pair_owners, 0, sorted_slots, out=pair_ids)
+        pair_slots.copy_(sorted_slots)
         tile_starts = binning.tile_starts(sorted_tiles, tiles)
         planes = device_layout.CHUNK_PLANES + depth
         # Only the device knows the number of chunks. This is an upper bound.
