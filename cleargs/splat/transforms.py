@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera
-from cleargs.splat.constants import QUATERNION_EPSILON, SH_C0, SH_C1, SH_C2, SH_C3
+from cleargs.splat.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
@@ -94,18 +94,6 @@ def transform_scene(
             hint="export the scene in the normalised world (without --world input)",
         )
     return replace(scene, gaussians=transformed)
-
-
-def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Return the rotation matrices [N, 3, 3] of quaternions w x y z [N, 4] of any norm (zero: identity)."""
-    unit = torch.nn.functional.normalize(quaternions, dim=-1, eps=QUATERNION_EPSILON)
-    w, x, y, z = unit.unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, -2)
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:
