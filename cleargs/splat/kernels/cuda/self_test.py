@@ -253,11 +253,6 @@ def faults(run: Run, gpu: Backend, cpu: Backend, device: torch.device) -> Iterat
 # -- pace and memory ---------------------------------------------------------------------------------------
 
 
-def allocated(device: torch.device) -> int:
-    """Return the bytes that tensors take on the GPU."""
-    return torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
-
-
 def iterate(view: View, repeats: int, backend: Backend, device: torch.device) -> tuple[float, int]:
     """Return the milliseconds of the fastest training step after three, and the growth of memory in bytes."""
     gaussians, camera = view.scene(device)
@@ -273,8 +268,8 @@ def iterate(view: View, repeats: int, backend: Backend, device: torch.device) ->
             backend.adam_step(getattr(gaussians, name), gradient, first, second, step, 0.0)
         float(gaussians.means[0, 0])  # waits for the device
         times.append(1e3 * (time.perf_counter() - start))
-        held = allocated(device) if step <= 3 else held
-    return min(times[3:]), allocated(device) - held
+        held = torch.cuda.memory_allocated() if step <= 3 else held
+    return min(times[3:]), torch.cuda.memory_allocated() - held
 
 
 def main(device: str = "cuda", sizes: Sizes = FULL) -> None:
