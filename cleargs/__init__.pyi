@@ -23,10 +23,10 @@ from cleargs.splat.config import TrainConfig as TrainConfig
 from cleargs.splat.gaussians import Gaussians as Gaussians
 from cleargs.splat.scene import Scene as Scene
 from cleargs.splat.views import TrainingView as TrainingView
-from cleargs.synth.synthetic_capture import make_capture as make_capture
 
 # An installed package has cleargs.stages. In a checkout it is the folder stages/, which mypy does not search.
 from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]
+from cleargs.synth.synthetic_capture import make_capture as make_capture
 
 View = TrainingView  # former name
 

@@ -1,7 +1,4 @@
-"""Shots of a run: a still, its camera path, a turntable, or the poses in a file.
-
-The file is a ``cameras.json`` as `cleargs export` writes it, or a ``transforms.json``.
-"""
+"""Shots of a run: a still, its camera path, a turntable, or the poses in a file."""
 
 from __future__ import annotations
 
@@ -64,7 +61,11 @@ class ShotOptions:
         """Raise InputError if the options contradict each other, or ``output``."""
         ending, still, posed = output.suffix.lower(), self.frame is not None, self.poses is not None
         for wrong, message, hint in (
-            (still + self.turntable + posed > 1, "--frame, --turntable, --poses: one too many", "give one of them"),
+            (
+                still + self.turntable + posed > 1,
+                "two of --frame, --turntable, --poses",
+                "give one of them",
+            ),
             (still and ending == ".mp4", "--frame is a still", "end --output with .png or .exr"),
             (self.world and not posed, "--world needs --poses", "give --poses, or omit --world"),
             (
@@ -195,7 +196,7 @@ def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | 
         world: Coordinates of the file (default: normalised for cameras.json, input for transforms.json).
 
     Raises:
-        InputError: if the file has another form, or if a pose is not a rotation and a translation.
+        InputError: The file has another form, or a pose is not a rotation and a translation.
     """
     try:
         document = read_json(path)

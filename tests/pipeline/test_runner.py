@@ -254,7 +254,7 @@ class Machine:
 
 
 def expected(bench: Bench) -> list[str]:
-    return [line.partition(" (")[0] for line in bench.remarks.lines if "estimate: " in line]
+    return [line.partition(",")[0] for line in bench.remarks.lines if "estimate: " in line]
 
 
 def test_long_work_is_estimated_at_the_measured_pace(bench: Bench) -> None:
