@@ -137,7 +137,7 @@ def reference_of(
             alignment = Alignment(world="scene", matched=len(views))
         else:
             if manifest.summary.get("poses") in ("sfm", "refined"):
-                observed = directory.parent / "observed"  # of a synthetic capture
+                observed = directory.parent / "observed"  # synthetic captures have it
                 if align is None and (observed / "transforms.json").is_file():
                     align = observed
                 known = listed if align is None else _listed(align)
