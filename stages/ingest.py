@@ -53,6 +53,9 @@ class IngestConfig(SfmConfig, CaptureConfig):
         return value
 
 
+FEW_FRAMES = 15
+"""Number of frames below which a warning is given."""
+
 DRAFT_FRAMES, DRAFT_SIZE = 60, 640
 """Most frames of a draft, and their longest side, px."""
 
@@ -156,6 +159,8 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
             "highlights compressed; record in SDR where colours must be exact"
         )
+    if len(capture.frames) < FEW_FRAMES:
+        reporter.warn(f"there are only {len(capture.frames)} frames; a good scene needs 30 or more")
     long_side = max(config.feature_size, config.max_size)
     capture = select_sharp_frames(capture, work, long_side, reporter)
     frames = prepare(capture, work, long_side, reporter)

@@ -17,9 +17,9 @@ import eval_world
 from colmap_model import write_sparse
 from eval_world import cameras, make_scene, write_run
 
-from cleargs.cli.export_pruning import crop_scene
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
+from cleargs.render.pruning import crop_scene
 from cleargs.splat.ply import read_ply
 
 
@@ -31,7 +31,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def export(run: Path, output: Path, *more: str) -> int:
-    return invoke(["export", str(run), "-o", str(output), *more])
+    return invoke(["export", str(run), "-o", str(output), "--cameras", *more])
 
 
 def test_the_ending_chooses_the_format(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
