@@ -38,14 +38,12 @@ def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter
     """
     if capture.kind != "video":
         return capture
-    videos = list(dict.fromkeys(frame.path for frame in capture.frames))
     frames: list[SourceFrame] = []
-    for number, video in enumerate(videos):
+    for number, video in enumerate(dict.fromkeys(frame.path for frame in capture.frames)):
         ours = [frame for frame in capture.frames if frame.path == video]
         file = folder / (CHOICE if number == 0 else f"{number}-{CHOICE}")
         frames += _sharpest_of(video, ours, capture.stretch, file, long_side, reporter)
-    same = all(one is two for one, two in zip(frames, capture.frames, strict=True))
-    return capture if same else replace(capture, frames=tuple(frames))
+    return replace(capture, frames=tuple(frames))
 
 
 def _sharpest_of(
@@ -128,8 +126,7 @@ def held_out(
         InputError: unknown names, or no registered frame is left for training.
     """
     kind, _, number = rule.partition(":")
-    if rule == "none":
-        return set()
+    chosen: set[int] = set()
     if kind == "every":
         chosen = set(range(0, len(names), int(number)))
     elif kind == "sharpest":
@@ -137,8 +134,8 @@ def held_out(
         candidates = [index for index in range(len(names)) if registered[index]]
         stretches = [candidates[start : start + period] for start in range(0, len(candidates), period)]
         chosen = {max(stretch, key=lambda index: sharpness(read(index))) for stretch in stretches}
-    else:
-        items = [item.strip() for item in rule.split(",") if item.strip()]
+    elif rule != "none":
+        items = filter(None, map(str.strip, rule.split(",")))
         chosen = {index for item in items for index in _matching(item, names)}
     if not any(flag and index not in chosen for index, flag in enumerate(registered)):
         raise InputError(f"ingest.holdout={rule} leaves no frame to train on", hint="hold out fewer frames")
