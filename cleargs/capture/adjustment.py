@@ -25,7 +25,7 @@ _TOLERANCE = 1e-5
 """Relative change of the cost at which an adjustment ends. COLMAP's 0 takes three times as long for the same
 poses."""
 
-_LENS_GAIN = 0.035
+_LENS_GAIN = 0.04
 """`FULL_LENS` is taken where it lowers the mean error of the matches that were kept out by at least this
 share (docs/experiments/poses.md)."""
 

@@ -163,12 +163,7 @@ def rigid_pose(camera_to_world: NDArray[np.float64], name: str, hint: str) -> Po
     """Return the pose of a camera-to-world matrix with OpenGL axes (x right, y up, z back).
 
     Printed poses are orthonormal to a few digits only, and some writers leave a scale in. The nearest
-    rotation is taken.
-
-    Args:
-        camera_to_world: matrix [3 or 4, 4] in the input's units.
-        name: name of the frame, for the error.
-        hint: remedy, for the error.
+    rotation is taken. ``name`` of the frame and ``hint`` are for the error.
 
     Raises:
         InputError: NaN, a coordinate above `MAX_COORDINATE`, a mirror image, or axes whose lengths differ by

@@ -3,9 +3,9 @@
 Pairs are all pairs, or neighbours and distant frames that look alike. No external vocabulary is needed: the
 words are clustered from the capture's own descriptors.
 
-COLMAP's threads do not always find the same matches: with two threads 2 of 76 runs over the same features
-differed (pycolmap 4.2.1), with one thread none of 60. Each process matches blocks of pairs in its own copy of
-the database. Its matches are copied back at the end, or by the next run if this one is killed.
+COLMAP's threads do not always find the same matches (docs/experiments/poses.md). Each process matches blocks
+of pairs in its own copy of the database. Its matches are copied back at the end, or by the next run if this
+one is killed.
 """
 
 from __future__ import annotations

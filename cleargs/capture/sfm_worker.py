@@ -42,7 +42,7 @@ from cleargs.safe_io import read_json
 _MIN_MODEL = 10
 """COLMAP's fewest frames of a model: it discards a smaller one and starts elsewhere. In a
 short capture it is a third of the frames, because eight of twelve are a model."""
-_CONVINCING, _UNEXPLAINED, _EXPLAINED = 0.3, 0.05, 1.5
+_CONVINCING, _UNEXPLAINED, _EXPLAINED = 0.3, 0.05, 1.3
 """Other poses and cameras are taken if matches that were kept out are then off by at most the first share of
 the error before (medians), or the second if they are still off by more than `_EXPLAINED` times the error that
 separate geometries of the pairs leave: poses that bend to explain blur or a rolling shutter are farther from
