@@ -160,6 +160,7 @@ def lay_over(
     """
     before = {image.name: image for image in given.images.values()}
     found = pycolmap.estimate_sim3d(_marks(held), _marks([before[image.name] for image in held]))
+    assert found is not None  # four marks of a camera fix one
     model.transform(found)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ def epipolar_errors(
     return np.concatenate(found)
 
 
-def _distances(first: Pixels, second: Pixels, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _distances(first: Any, second: Any, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(pycolmap.compute_squared_sampson_error(first, second, matrix))
 
 

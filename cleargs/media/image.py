@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image, ImageCms, ImageOps
+from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
@@ -45,12 +45,13 @@ _HINT = "copy the file again, convert it to JPEG or PNG, or remove it"
 def lens_name(path: Path) -> tuple[str, ...]:
     """Return camera, lens and focal lengths by the EXIF of the image in ``path``.
 
-    Phones have several lenses whose images are of one size.
+    Phones have several lenses whose images are of one size. Empty if the file cannot be read.
     """
-    with _opened(path) as image:
+    with suppress(InputError), _opened(path) as image:
         exif = image.getexif()
         more = exif.get_ifd(_EXIF)
         return tuple(str(value) for value in (exif.get(_MODEL), *map(more.get, _LENS)))
+    return ()
 
 
 def is_panorama(path: Path) -> bool:
@@ -169,7 +170,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             with opened:
                 yield opened
     except _FAULTS as error:
-        reason = "" if isinstance(error, Image.UnidentifiedImageError) else f": {cause(error)}"
+        reason = "" if isinstance(error, UnidentifiedImageError) else f": {cause(error)}"
         raise InputError(f"{path} is not an image that can be read{reason}", hint=_HINT) from error
 
 
@@ -192,12 +193,13 @@ def _jpeg_xl(path: Path) -> Image.Image:
     from OpenImageIO import ImageInput, geterror
 
     source = ImageInput.open(str(path))
-    spec = None if source is None else source.spec()
-    small = spec is not None and spec.width * spec.height <= MAX_PIXELS
-    pixels = source.read_image("uint8") if small else None
-    geterror()  # else OpenImageIO prints it on stderr at the end
+    if source is None:
+        raise ValueError(geterror())  # read here, else OpenImageIO prints it on stderr at the end
+    spec = source.spec()
+    pixels = source.read_image("uint8") if spec.width * spec.height <= MAX_PIXELS else None
+    geterror()
     if pixels is None or pixels.ndim != 3:
-        raise ValueError("damaged, or too large")
+        raise ValueError("it is damaged, or too large")
     image = Image.fromarray(pixels if pixels.shape[2] > 2 else pixels[..., 0])
     image.getexif()[_ORIENTATION] = spec.get_int_attribute("Orientation", 1)
     profile = spec.getattribute("ICCProfile")
