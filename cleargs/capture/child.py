@@ -51,7 +51,7 @@ def _die_with_parent() -> None:
 def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
     """Run ``python -P -m module job`` to its end, showing its progress.
 
-    What ends this call early (Ctrl-C above all) kills the child, and what it started, first.
+    If this call ends early (Ctrl-C above all), the child and what it started are killed first.
 
     Raises:
         StageError: with the child's cause, or with the last failed check in ``log`` when it aborted.

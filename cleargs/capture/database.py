@@ -93,9 +93,24 @@ def remove_database(database: Path) -> None:
 def copy_without_features(database: Path, copy: Path, image_ids: Collection[int]) -> None:
     """Copy COLMAP's ``database`` without the features and matches of these images."""
     remove_database(copy)
-    listed = ", ".join(str(int(image_id)) for image_id in image_ids)
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
         source.backup(target)
+    remove_features(copy, image_ids)
+
+
+def frames_with_few_features(database: Path, names: Collection[str], limit: float) -> dict[str, int]:
+    """Return images of these names with fewer features than ``limit``, and their ids; none once matched."""
+    with pycolmap.Database.open(database) as opened:
+        if opened.num_matched_image_pairs():
+            return {}
+        ids = {image.name: image.image_id for image in opened.read_all_images() if image.name in names}
+        return {name: key for name, key in ids.items() if opened.num_keypoints_for_image(key) < limit}
+
+
+def remove_features(database: Path, image_ids: Collection[int]) -> None:
+    """Remove the features and matches of these images from ``database``."""
+    listed = ", ".join(str(int(image_id)) for image_id in image_ids)
+    with closing(sqlite3.connect(database)) as target:
         for table in ("keypoints", "descriptors"):
             target.execute(f"DELETE FROM {table} WHERE image_id IN ({listed})")
         for table in ("matches", "two_view_geometries"):

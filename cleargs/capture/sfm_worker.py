@@ -29,6 +29,8 @@ from cleargs.capture.database import (
     colmap_cameras,
     copy_without_features,
     create_database,
+    frames_with_few_features,
+    remove_features,
     set_cameras,
     why_missing,
 )
@@ -75,6 +77,9 @@ class _FeatureSettings:
 
 _FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
+_FEW, _FAINT = 0.25, 0.002
+"""Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
+plain frames, through which a chain of frames loses its scale (docs/experiments/poses.md)."""
 _AGAIN = (
     _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15, suffix=" again"),
     _FeatureSettings(
@@ -222,8 +227,12 @@ class _Sfm:
         return model, placed
 
     def _extract(self, database: Path, names: Sequence[str], settings: _FeatureSettings) -> None:
-        """SIFT on the working images; frames that have features already are skipped by COLMAP."""
+        """SIFT on the working images; frames that have features already are skipped by COLMAP.
+
+        Those for which ``settings`` find few features get fainter ones too, unless a killed run matched them.
+        """
         job = self._job
+        limit = _FEW * job.config.max_features if settings.contrast > _FAINT else 0
         options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         largest = max(max(camera.width, camera.height) for camera in job.cameras)
         options.max_image_size = largest // settings.reduced
@@ -239,6 +248,14 @@ class _Sfm:
             pycolmap.extract_features(
                 database, job.images, image_names=block, reader_options=reader, extraction_options=options
             )
+            few = frames_with_few_features(database, block, limit)
+            if few:
+                remove_features(database, few.values())
+                faint = copy.deepcopy(options)
+                faint.sift.peak_threshold = _FAINT
+                pycolmap.extract_features(
+                    database, job.images, image_names=[*few], reader_options=reader, extraction_options=faint
+                )
             self._report(done=start + len(block))
 
     def _match(self, database: Path, pairs: Sequence[tuple[int, int]], settings: _FeatureSettings) -> None:
