@@ -20,13 +20,13 @@ from cleargs.capture import sfm_worker
 from cleargs.capture.adjustment import FULL_LENS, Adjuster, lay_over, median_residual, set_lens
 from cleargs.capture.cameras import Pose, normalise, pinhole
 from cleargs.capture.colmap import pycolmap
+from cleargs.capture.config import CaptureConfig, SfmConfig
 from cleargs.capture.database import create_database
 from cleargs.capture.prepare import WorkFrame, prepare
 from cleargs.capture.sfm import job_of
 from cleargs.capture.sfm_job import OWN
 from cleargs.capture.sources import open_capture
 from cleargs.progress import SilentReporter
-from cleargs.stages.ingest import IngestConfig
 from cleargs.synth.protocols import PROTOCOLS
 from cleargs.synth.synthetic_capture import make_capture
 
@@ -53,10 +53,11 @@ FAULTS = ("gs2e-severe", "gsotm-rs", "gsotm-mb-rs")
 
 FIGURES = (
     *("missed", "floor", "before", "adjusted", "sfm"),
+    *("mean_adjusted", "mean_sfm"),
     *("off_before", "off_adjusted", "off_sfm", "lens_gain"),
 )
-"""Residual at the given poses, the errors of the kept-out matches (px, medians), the distances of the cameras
-from the true ones (medians, share of the farthest camera's distance), and the gain by the richer lens."""
+"""Residual at the given poses, errors of the kept-out matches (px; medians, then means up to 4), distances of
+the cameras from the true ones (medians, in the farthest camera's distance), and gain by the richer lens."""
 
 
 @click.command()
@@ -104,8 +105,8 @@ def rooms(folder: Path, seed: int, size: int) -> list[Path]:
 
 def measure(capture: Path, work: Path, size: int) -> list[dict[str, str | float]]:
     """Return a row for each of `GIVEN`."""
-    config = IngestConfig(max_size=size, feature_size=size, max_features=700)
-    frames = prepare(open_capture(capture, config), work, size, SilentReporter())
+    config = SfmConfig(max_features=700)
+    frames = prepare(open_capture(capture, CaptureConfig()), work, size, SilentReporter())
     given = [frame.source.pose for frame in frames if frame.source.pose is not None]
     if given:
         assert frames[0].camera is not None
@@ -134,14 +135,15 @@ def measure(capture: Path, work: Path, size: int) -> list[dict[str, str | float]
             gain = np.nan if found is None else _gain(adjuster, found)
         models = (start, adjusted, found)
         errors = [np.nan if model is None else adjuster.median_error(model) for model in models]
+        means = [np.nan if model is None else adjuster.mean_error(model) for model in models[1:]]
         off = [np.nan if model is None else _off(model, true) for model in models]
-        figures = median_residual(start), adjuster.floor, *errors, *off, gain
+        figures = median_residual(start), adjuster.floor, *errors, *means, *off, gain
         rows.append({"capture": capture.name, "given": name, **dict(zip(FIGURES, figures, strict=True))})
     return rows
 
 
 def _reconstructed(
-    frames: Sequence[WorkFrame], work: Path, config: IngestConfig
+    frames: Sequence[WorkFrame], work: Path, config: SfmConfig
 ) -> tuple[list[WorkFrame], list[Pose], float]:
     """Return the frames that SfM places, their poses, and the focal length."""
     sfm = _worker(frames, None, work, config)
@@ -155,7 +157,7 @@ def _reconstructed(
 
 
 def _worker(
-    frames: Sequence[WorkFrame], poses: Sequence[Pose] | None, work: Path, config: IngestConfig
+    frames: Sequence[WorkFrame], poses: Sequence[Pose] | None, work: Path, config: SfmConfig
 ) -> sfm_worker._Sfm:
     """Return COLMAP's work on ``frames`` after their features were matched."""
     job = job_of(frames, None if poses is None else {OWN: poses}, work, config, 0, 1)
@@ -193,5 +195,4 @@ def _gain(adjuster: Adjuster, model: pycolmap.Reconstruction) -> float:
     full = copy.deepcopy(simple)
     set_lens(full, FULL_LENS)
     full = adjuster._adjusted(full, cameras=True)
-    before, after = (np.minimum(adjuster.errors(each), 4.0).sum() for each in (simple, full))
-    return float(1 - after / before)
+    return 1 - adjuster.mean_error(full) / adjuster.mean_error(simple)

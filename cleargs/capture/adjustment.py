@@ -30,7 +30,7 @@ _LENS_GAIN = 0.04
 share (docs/experiments/poses.md)."""
 
 _CAPPED_PX = 4.0
-"""Errors count up to this for it: COLMAP takes a match for right within 4 px of its epipolar line."""
+"""Errors count up to this in means: COLMAP takes a match for right within 4 px of its epipolar line."""
 
 _HELD_BY = 15
 """Fewest points that a frame must see to take part in an adjustment."""
@@ -72,6 +72,11 @@ class Adjuster:
         """Return the median of `errors`; 0 where no match was kept out."""
         return _median(self.errors(model))
 
+    def mean_error(self, model: pycolmap.Reconstruction) -> float:
+        """Return the mean of `errors` up to `_CAPPED_PX`, which counts single frames that are wrong, too."""
+        errors = np.minimum(self.errors(model), _CAPPED_PX)
+        return float(errors.sum() / max(1, len(errors)))
+
     def refine(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction | None:
         """Return ``model`` with poses, points and, with ``cameras``, lenses adjusted.
 
@@ -105,8 +110,8 @@ class Adjuster:
         full = copy.deepcopy(model)
         set_lens(full, FULL_LENS)
         full = self._adjusted(full, cameras=True)
-        before, after = (np.minimum(self.errors(each), _CAPPED_PX).sum() for each in (model, full))
-        return full if after < (1 - _LENS_GAIN) * before and _held(full) else model
+        better = self.mean_error(full) < (1 - _LENS_GAIN) * self.mean_error(model)
+        return full if better and _held(full) else model
 
     def _adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
         options = pycolmap.BundleAdjustmentOptions(

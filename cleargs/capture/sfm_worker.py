@@ -50,8 +50,8 @@ the error before (medians), or the second if they are still off by more than `_E
 separate geometries of the pairs leave: poses that bend to explain blur or a rolling shutter are farther from
 the truth than given ones, unless these are far off. All three, and the next, by docs/experiments/poses.md."""
 _NEARER = 0.9
-"""SfM is preferred to adjusted poses only if it lowers the error to at most this share: where both are right,
-they are alike, and adjusted poses are in the user's world exactly."""
+"""SfM is preferred to adjusted poses only if it lowers the mean error to at most this share: where both are
+right, they are alike, and adjusted poses are in the user's world exactly."""
 _FITS_PX, _FITS = 2.0, 0.5
 """Poses fit the images where at least this share of the matches is within this many pixels of its epipolar
 line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes, 0.13 with inverted ones."""
@@ -176,9 +176,10 @@ class _Sfm:
         if found is not None:
             models["sfm"] = found
         errors = {method: adjuster.median_error(model) for method, model in models.items()}
-        best = min(models, key=lambda method: errors[method])
-        if best == "sfm" and adjusted is not None and errors["sfm"] > _NEARER * errors["adjusted"]:
-            best = "adjusted"
+        best = "given" if adjusted is None else "adjusted"
+        limit = np.inf if adjusted is None else _NEARER * adjuster.mean_error(adjusted)
+        if found is not None and adjuster.mean_error(found) <= limit:
+            best = "sfm"
         share = _CONVINCING if errors[best] <= _EXPLAINED * adjuster.floor else _UNEXPLAINED
         if not 0 < errors[best] <= share * errors["given"]:
             return start, outcome.model_copy(update={"errors_px": errors})
