@@ -71,7 +71,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update=limits)
 
 
-VERSION = 9
+VERSION = 10
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -183,7 +183,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
             "pose_convention": outcome.convention if capture.posed else None,
             "kept_out_matches_off_px": {name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
-            "lens": outcome.lens or None,
+            "cameras": scene.cameras(),
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),

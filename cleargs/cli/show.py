@@ -46,7 +46,7 @@ LABELS: Mapping[str, str] = {
     "given_poses_missed_px": "median reprojection error at the given poses, px",
     "pose_convention": "convention of the given poses",
     "kept_out_matches_off_px": "median error of matches that took no part, by origin of the poses, px",
-    "lens": "camera model that was fitted",
+    "focal_px": "focal length, px",
     "stand_in": "stand-ins for reliable frames",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
@@ -225,7 +225,7 @@ def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield from labelled(value, f"{label}: ")
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
             for number, item in enumerate(value, 1):
-                yield from labelled(item, f"round {number}: ")
+                yield from labelled(item, f"{'camera' if name == 'cameras' else 'round'} {number}: ")
         elif text := text_of(value):
             yield label, text
 
