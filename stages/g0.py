@@ -64,7 +64,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 25
+VERSION = 26
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -149,7 +149,13 @@ def run(context: StageContext[G0Config]) -> StageResult:
         say=lambda remark: context.reporter.info(f"G0: {remark}"),
     )
     exposure, spread = _exposure(config, views, sparse)
-    formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
+    formation = CaptureFormation(
+        views,
+        config.formation,
+        exposure=exposure,
+        lr_exposure=config.lr_exposure,
+        draft=config.quality == "draft",
+    )
     trainer = Trainer(
         Scene(gaussians, config.antialias, config.background),
         views,
