@@ -104,7 +104,7 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
     start = max(config.min_points, sparse_points(context))
     seconds, memory = training_cost(config, count, megapixels, start)
     seconds *= pace(context.threads)
-    disk = 0.7 * memory  # scene and state: 1 kB a Gaussian
+    disk = 0.5 * memory  # scene and moments: 0.7 kB per Gaussian of SH degree 3
     memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
     return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=disk)
 
