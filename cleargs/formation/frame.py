@@ -14,15 +14,15 @@ from torch import Tensor
 
 from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit, explained_share, luminance
 from cleargs.formation.exposure import apply_affine
-from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model, widened
+from cleargs.formation.motion import MODELS, TWISTS, FrameMotion, Model, widened
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
 from cleargs.formation.search import blur_along, preferred, refine, search
-from cleargs.formation.warp import Warp, displacement_fields
+from cleargs.formation.warp import Warp, displacement_fields, path_lengths
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
-from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
+from cleargs.splat.kernels.warp_layout import BEND_REACH, CHANNELS, CUBE_REACH, DisplacementFields
 from cleargs.splat.types import Render
 
 EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
@@ -39,7 +39,7 @@ MARGIN_SHARE = 0.25
 LENS = ("disc_px", "focus", "median_depth")
 MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
 """Numbers of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
-TWISTS, AXES = ("pose", "blur", "skew"), ("tx", "ty", "tz", "rx", "ry", "rz")
+AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
@@ -226,15 +226,15 @@ def _described(
     def fields(of: FrameMotion) -> DisplacementFields:
         return displacement_fields(of, camera, depth, alpha, margin, factor)
 
-    whole, turned = fields(motion), fields(replace(motion, pose=np.zeros(TWIST), blur=motion.skew))
+    whole, turned = fields(motion), fields(FrameMotion(blur=motion.skew, median_depth=motion.median_depth))
     return replace(
         frame,
         motion=motion,
         model=best.model,
         misfit=best.misfit,
         misfit_still=best.misfit_still,
-        blur_px=_mean_length(whole.sweep) / factor,
-        skew_px=_mean_length(turned.sweep) / factor,
+        blur_px=float(path_lengths(whole).mean(dtype=np.float64)) / factor,
+        skew_px=float(path_lengths(turned).mean(dtype=np.float64)) / factor,
         defocus_px=float(whole.radius.cpu().numpy().mean(dtype=np.float64)) / factor,
         reach_px=reach_of(whole) / factor,
     )
@@ -243,11 +243,9 @@ def _described(
 def reach_of(fields: DisplacementFields) -> float:
     """Return the reach of the pixels, px: see `FrameFormation.reach_px`."""
     displacements = fields.offset.abs() + 0.5 * fields.sweep.abs() + fields.radius
+    if fields.curve is not None:
+        displacements += BEND_REACH * fields.curve[:2].abs() + CUBE_REACH * fields.curve[2:].abs()
     return float(np.quantile(displacements.amax(dim=0)[::4, ::4].cpu().numpy(), 0.95))
-
-
-def _mean_length(field: Tensor) -> float:
-    return float(np.hypot(*field.cpu().numpy()).mean(dtype=np.float64))
 
 
 def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
@@ -268,13 +266,13 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
     row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws")}
     for name in TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
-    row |= {name: getattr(motion, name) for name in LENS}
+    row |= {name: getattr(motion, name) for name in LENS} | {"order": motion.order}
     return row | {name: getattr(frame, name) for name in (*MEASURED, "skew_gain")}
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame of which `as_row` gave this row; an older table has no ``draws``."""
-    vector = np.array([row[f"{name}_{axis}"] for name in TWISTS for axis in AXES])
+    """Return the frame of which `as_row` gave this row; an older table has no ``draws`` and no curves."""
+    vector = np.array([row.get(f"{name}_{axis}") or 0.0 for name in TWISTS for axis in AXES])
     return FrameFormation(
         row["frame_id"],
         FrameMotion(**{name: row[name] for name in LENS}).with_vector(vector),

@@ -21,7 +21,7 @@ from cleargs.formation.comparison import (
     MotionFit,
     scales,
 )
-from cleargs.formation.motion import TWIST, FrameMotion, Model
+from cleargs.formation.motion import BEND, BLUR, CUBE, POSE, SKEW, TWIST, TWISTS, FrameMotion, Model
 from cleargs.splat.backend import SearchKernels
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.types import ArrayF64
@@ -51,7 +51,9 @@ zero."""
 CONVERGED = 1e-3
 MAX_TRIES = 4
 
-POSE, BLUR, SKEW = (slice(k * TWIST, (k + 1) * TWIST) for k in range(3))
+ORDER_PENALTY = 0.01
+"""The same for each further order of the path."""
+
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
 
@@ -84,18 +86,19 @@ def search(
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
     starts = _starts(coarse, still) if start is None else _near(coarse, still, start)
     begun = _best(coarse, starts, models[0], LEVELS[0][1], pose)
-    found: dict[Model, FrameMotion] = {}
+    found: list[tuple[Model, FrameMotion]] = [("none", still)]
     for model in models:
-        motion = _restricted(begun, model)
+        paths = [_restricted(begun, model)]
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
-            motion = _best(level, [motion, still], model, steps, pose)
-        found[model] = motion
+            straight = _best(level, [paths[0], still], model, steps, pose)
+            paths = [straight, *_curved(level, straight, model, steps, pose, paths[1:])]
+        found += [(model, path) for path in paths]
     if defocus:
         disc = _sharpest_disc(coarse, still)
         for level in levels[1:]:
             disc = _narrowed(level, disc)
-        found["defocus"] = disc
-    return [levels[-1].evaluate("none", still), *(levels[-1].evaluate(name, found[name]) for name in found)]
+        found.append(("defocus", disc))
+    return [levels[-1].evaluate(model, motion) for model, motion in found]
 
 
 def refine(
@@ -119,28 +122,54 @@ def refine(
     if model == "defocus":
         motion = _narrowed(level, motion)
     else:
-        motion = _best(level, [motion], model, WARM_STEPS, pose)
+        motion = _best(level, [motion], model, WARM_STEPS, pose, motion.order)
     return [level.evaluate("none", still), level.evaluate(model, motion)]
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
-    """Return the model with the least misfit on the held-out pixels; each further motion has a price."""
-    return min(found, key=lambda e: e.misfit * (1.0 + MODEL_PENALTY * _PARTS[e.model]))
+    """Return the fit with the least misfit on the held-out pixels.
+
+    Each further motion has a price, and each further order of the path.
+    """
+
+    def price(fit: MotionFit) -> float:
+        return MODEL_PENALTY * _PARTS[fit.model] + ORDER_PENALTY * (fit.motion.order - 1)
+
+    return min(found, key=lambda fit: fit.misfit * (1.0 + price(fit)))
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
-    vector = np.zeros(3 * TWIST)
+    vector = np.zeros_like(motion.vector)
     for part in (POSE, *_ACTIVE[model]):
         vector[part] = motion.vector[part]
     return motion.with_vector(vector)
 
 
-def _best(level: Level, starts: list[FrameMotion], model: Model, steps: int, pose: bool) -> FrameMotion:
-    """Return the best end of the descents from ``starts``."""
-    parts = (POSE, *_ACTIVE[model]) if pose else _ACTIVE[model]
-    active = np.concatenate([np.arange(3 * TWIST)[part] for part in parts])
+def _best(
+    level: Level, starts: list[FrameMotion], model: Model, steps: int, pose: bool, order: int = 1
+) -> FrameMotion:
+    """Return the best end of the descents from ``starts`` with a path of ``order``."""
+    parts = [*_ACTIVE[model], *((BEND, CUBE)[: order - 1])]
+    active = np.concatenate(
+        [np.arange(len(TWISTS) * TWIST)[part] for part in ([POSE] if pose else []) + parts]
+    )
     ends = [_descend(level, start, active, steps) for start in starts]
     return min(ends, key=level.cost)
+
+
+def _curved(
+    level: Level, straight: FrameMotion, model: Model, steps: int, pose: bool, known: list[FrameMotion]
+) -> list[FrameMotion]:
+    """Return a quadratic and a cubic path next to a straight one; none without a blur.
+
+    ``known`` are those of the level before.
+    """
+    paths = [straight]
+    if BLUR in _ACTIVE[model] and straight.blur.any():
+        for order in (2, 3):
+            starts = [paths[-1], *known[order - 2 : order - 1]]
+            paths.append(_best(level, starts, model, steps, pose, order))
+    return paths[1:]
 
 
 def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:

@@ -9,9 +9,11 @@ import torch
 from helpers.observations import CAMERA, MEDIAN, Image, twist, wall, wall_fields
 from helpers.warp_oracle import (
     ALL,
+    BENT,
     LONG,
     ROLLED,
     SCALE,
+    SLIGHTLY_BENT,
     SMALL,
     constant_fields,
     dot,
@@ -43,13 +45,24 @@ Doubles = npt.NDArray[np.float64]
 CPU = torch.device("cpu")
 
 
+MOTIONS = {
+    "many samples": ALL,
+    "one sample": ROLLED,
+    "two passes": LONG,
+    "curved": BENT,
+    "curved, two passes": SLIGHTLY_BENT,
+}
+
+
 @pytest.mark.parametrize("margin", [0, 12])
-@pytest.mark.parametrize("motion", [ALL, ROLLED, LONG], ids=["many samples", "one sample", "two passes"])
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int) -> None:
     wide = torch.from_numpy(np.pad(wall(), margin, mode="edge"))
     fields = displacement_fields(motion, CAMERA, wide, torch.ones_like(wide), margin)
     warp = Warp.of(fields, margin)
-    assert (len(warp.samples) == 1) == (motion is ROLLED) and (warp.between is None) == (motion is not LONG)
+    assert (len(warp.samples) == 1) == (motion is ROLLED)
+    assert (warp.between is not None) == (motion in (LONG, SLIGHTLY_BENT))
+    assert (fields.curve is None) == (motion not in (BENT, SLIGHTLY_BENT))
     image = random_image(*wide.shape)
     expected = oracle(image[..., :3], warp)
     made = warp.forward(image)[..., :3]
@@ -64,7 +77,7 @@ def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int
     assert np.abs(gradient).max() > 0.5
 
 
-@pytest.mark.parametrize("motion", [ALL, LONG], ids=["one pass", "two passes"])
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_transpose_is_the_transpose(motion: FrameMotion) -> None:
     rng = np.random.default_rng(0)
     fields = wall_fields(motion)
@@ -92,6 +105,8 @@ CASES = {
     "many samples": lambda: moved(ALL),
     "one sample": lambda: moved(ROLLED),
     "two passes": lambda: moved(LONG),
+    "curved": lambda: moved(BENT),
+    "curved, two passes": lambda: moved(SLIGHTLY_BENT),
     "longer than the image": lambda: (constant_fields(9, 14, 60.0, 0.0), 0),
     "higher than the image": lambda: (constant_fields(9, 14, 0.0, 60.0, 2.0), 0),
     "one pixel": lambda: (constant_fields(1, 1, 5.0, 5.0, 1.0), 0),
@@ -286,7 +301,7 @@ def test_the_whole_chain_has_the_gradient_that_finite_differences_show() -> None
     assert dot(gradient, direction) == pytest.approx(difference, rel=2e-3)
 
 
-@pytest.mark.parametrize("motion", [ALL, LONG], ids=["one pass", "two passes"])
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_threads_do_not_change_a_bit(motion: FrameMotion) -> None:
     image = random_image(*wall().shape)
     results = []
