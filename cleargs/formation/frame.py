@@ -89,6 +89,7 @@ def fit_motion(
     render: Renderer,
     *,
     factor: float = 1.0,
+    pose: bool = False,
     doubted: bool = False,
     rolling: bool = False,
     test_rolling: bool = False,
@@ -109,10 +110,11 @@ def fit_motion(
         mask: Its mask, [H, W].
         render: Renders the scene with depth.
         factor: Size of ``camera`` over that of the frame.
+        pose: Correct the pose together with a motion.
         doubted: RVA doubts the frame, so less evidence is needed for a search.
         rolling: Admit models with a skew.
         test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
-        again: Search a frame of a rolling shutter again.
+        again: Try a path of a higher order, and search a frame of a rolling shutter again.
     """
     # A formation that was found under the other assumption about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
@@ -122,8 +124,9 @@ def fit_motion(
     pair = frame_pair(rendered, affine, target, mask, camera, margin)
     kernels = backend_for(rendered.image.device)
     known = _scaled(frame.motion, factor)
-    found = refine(pair, frame.model, known, pose=config.pose, kernels=kernels)
-    best = _accepted(found[-1], found[0], frame.model, config)
+    found = refine(pair, frame.model, known, pose=pose, curve=again, kernels=kernels)
+    followed = preferred(found[1:] or found)
+    best = _accepted(followed, found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
     skews = rolling or test_rolling
     first = frame.draws == 0  # a scene that is still soft hides short blurs from the test
@@ -135,19 +138,18 @@ def fit_motion(
             margin, rendered = wide, render(widened(camera, wide))
             pair = frame_pair(rendered, affine, target, mask, camera, margin)
         whole = evidence if best.model == "none" else _unexplained(pair, rendered, found[0])
-        before = found[-1]
         found = search(
             pair,
             start=None if skews else blur_along(whole.length, whole.angle),
             skew=skews,
             defocus=skews or whole.disc_gain > whole.line_gain,
-            pose=config.pose,
+            pose=pose,
             kernels=kernels,
         )
         if skews:
             frame = replace(frame, skew_gain=_skew_gain(found))
-        if before.model != "none":
-            found += refine(pair, before.model, before.motion, pose=config.pose, kernels=kernels)[1:]
+        if followed.model != "none":
+            found += refine(pair, followed.model, followed.motion, pose=pose, kernels=kernels)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
         best = _accepted(best, found[0], frame.model, config)
     return _described(frame, best, factor, camera, rendered, margin)

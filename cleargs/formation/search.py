@@ -51,6 +51,8 @@ zero."""
 CONVERGED = 1e-3
 MAX_TRIES = 4
 
+MAX_ORDER = 3
+"""Highest order of a path in time."""
 ORDER_PENALTY = 0.01
 """The same for each further order of the path."""
 
@@ -78,7 +80,7 @@ def search(
         kernels: Back end that computes misfits and normal equations.
 
     Returns:
-        The fit of ``none`` first, then one of each model.
+        The fit of ``none`` first, then one of each model, those with a blur by the order of the path.
     """
     levels = [Level(pair, scale, kernels) for scale in scales(pair)]
     coarse = levels[0]
@@ -107,12 +109,21 @@ def refine(
     motion: FrameMotion,
     *,
     pose: bool = False,
+    curve: bool = False,
     kernels: SearchKernels = cpu,
 ) -> list[MotionFit]:
     """Fit ``model`` again from the numbers of the last fit, at the finest level.
 
+    Args:
+        pair: The frame and the render.
+        model: The model.
+        motion: The last fit.
+        pose: Correct the pose, too.
+        curve: Try the next order of the path, too.
+        kernels: Back end that computes misfits and normal equations.
+
     Returns:
-        The fit of ``none`` first, then that of ``model`` where it is another.
+        The fit of ``none`` first, then that of ``model`` where it is another, then that of the next order.
     """
     level = Level(pair, scales(pair)[-1], kernels)
     if model == "none":
@@ -120,10 +131,13 @@ def refine(
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
-        motion = _narrowed(level, motion)
+        paths = [_narrowed(level, motion)]
     else:
-        motion = _best(level, [motion], model, WARM_STEPS, pose, motion.order)
-    return [level.evaluate("none", still), level.evaluate(model, motion)]
+        order = motion.order
+        paths = [_best(level, [motion], model, WARM_STEPS, pose, order)]
+        if curve and order < MAX_ORDER and BLUR in _ACTIVE[model]:
+            paths.append(_best(level, paths, model, WARM_STEPS, pose, order + 1))
+    return [level.evaluate("none", still), *(level.evaluate(model, path) for path in paths)]
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
@@ -166,7 +180,7 @@ def _curved(
     """
     paths = [straight]
     if BLUR in _ACTIVE[model] and straight.blur.any():
-        for order in (2, 3):
+        for order in range(2, MAX_ORDER + 1):
             starts = [paths[-1], *known[order - 2 : order - 1]]
             paths.append(_best(level, starts, model, steps, pose, order))
     return paths[1:]
