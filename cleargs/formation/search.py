@@ -54,7 +54,7 @@ MAX_TRIES = 4
 MAX_ORDER = 3
 """Highest order of a path in time."""
 ORDER_PENALTY = 0.01
-"""The same for each further order of the path."""
+"""Share of the misfit without any motion that each further order of the path must explain to be preferred."""
 
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
@@ -146,10 +146,11 @@ def preferred(found: list[MotionFit]) -> MotionFit:
     Each further motion has a price, and each further order of the path.
     """
 
-    def price(fit: MotionFit) -> float:
-        return MODEL_PENALTY * _PARTS[fit.model] + ORDER_PENALTY * (fit.motion.order - 1)
+    def cost(fit: MotionFit) -> float:
+        model = fit.misfit * (1.0 + MODEL_PENALTY * _PARTS[fit.model])
+        return model + ORDER_PENALTY * fit.misfit_still * (fit.motion.order - 1)
 
-    return min(found, key=lambda fit: fit.misfit * (1.0 + price(fit)))
+    return min(found, key=cost)
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
