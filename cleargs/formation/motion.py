@@ -107,3 +107,23 @@ def flow_basis(
     along_y = np.stack([none, -nearness, y * nearness, 1 + y * y, -x * y, -x]) * (camera.fy / camera.fx)
     scales = width / camera.width, height / camera.height
     return np.stack([scales[0] * along_x, scales[1] * along_y], axis=1).astype(np.float32)
+
+
+def pixel_paths(
+    motion: FrameMotion, camera: Camera, shape: tuple[int, int], times: ArrayF64
+) -> ArrayF64:  # [T, rows, columns, 2] px
+    """Return the displacements of the pixels at the centres of a grid at ``times`` of the exposure.
+
+    They are those at the median depth, relative to the mean of the exposure.
+
+    Args:
+        motion: The frame's motion.
+        camera: Its camera.
+        shape: Rows and columns of the grid.
+        times: Times from -1/2 to 1/2.
+    """
+    basis = flow_basis(camera, np.ones(shape, np.float32)).astype(np.float64)
+    basis *= np.array([camera.width / shape[1], camera.height / shape[0]])[:, None, None]
+    orders = np.stack([times, times**2 - 1 / 12, times**3 - 3 * times / 20])
+    twists = np.stack([motion.blur, motion.bend, motion.cube])
+    return np.asarray(np.einsum("ot,on,ncij->tijc", orders, twists, basis))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -24,7 +26,7 @@ from helpers.warp_oracle import (
 )
 from torch import Tensor
 
-from cleargs.formation.motion import FrameMotion
+from cleargs.formation.motion import FrameMotion, pixel_paths
 from cleargs.formation.warp import (
     Warp,
     displacement_fields,
@@ -253,6 +255,43 @@ def test_two_passes_give_what_one_with_all_samples_gives() -> None:
     # 5e-4, at a border, where pixels outside the image are assumed to equal it.
     assert difference[:, 95:105].max() < 0.04
     assert max(difference[:, :95].max(), difference[:, 105:-4].max()) < 1e-3
+
+
+@pytest.mark.parametrize("bend", [2.0, 6.0])
+def test_two_passes_along_a_curve_give_what_one_with_all_samples_gives(bend: float) -> None:
+    """A blur of 30 px that bends by a sixth of ``bend``; the parts differ from their mean by half a pixel."""
+    motion = FrameMotion(
+        blur=twist(0, 0, 0, 0, 30, 0),
+        bend=twist(0, 0, 0, bend, 0, 0),
+        cube=twist(0, 0, 0, 0, 6, 0),
+        median_depth=MEDIAN,
+    )
+    fields = wall_fields(motion)
+    two, one = Warp.of(fields), Warp(fields, 0, torch.from_numpy(samples(64)))
+    assert two.between is not None and len(two.samples) + len(two.between.samples) < 20
+    y, x = np.indices(wall().shape, float)
+    waves = 0.5 + 0.2 * np.sin(x / 3.0) * np.cos(y / 2.0)
+    image = torch.from_numpy(padded(np.repeat(waves[..., None], 3, 2).astype(np.float32)))
+    straight = Warp(fields._replace(curve=None), 0, torch.from_numpy(samples(64)))
+    inner = np.s_[4:-4, 20:-20, 0]
+    error = (two.forward(image) - one.forward(image))[inner].abs().max()
+    # The waves span 0.4, and what a straight path would give is 0.01 and 0.04 away.
+    assert error < 0.004 < (straight.forward(image) - one.forward(image))[inner].abs().max()
+
+
+def test_the_paths_of_pixels_are_those_of_the_fields() -> None:
+    times = np.array([-0.5, -0.1, 0.3])
+    motion = replace(BENT, pose=np.zeros(6))
+    fields = displacement_fields(motion, CAMERA, torch.full(wall().shape, MEDIAN), torch.ones(wall().shape))
+    assert fields.curve is not None
+    shape = CAMERA.height, CAMERA.width
+    found = pixel_paths(motion, CAMERA, shape, times)
+    for t, displacement in zip(times, found, strict=True):
+        curve = (t**2 - 1 / 12) * fields.curve[:2] + (t**3 - 0.15 * t) * fields.curve[2:]
+        np.testing.assert_allclose(displacement, (t * fields.sweep + curve).permute(1, 2, 0), atol=1e-4)
+    # A coarse grid has the paths of the pixels at its centres.
+    coarse = pixel_paths(motion, CAMERA, (CAMERA.height // 5, CAMERA.width // 5), times)
+    np.testing.assert_allclose(coarse, found[:, 2::5, 2::5], atol=1e-4)
 
 
 def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
