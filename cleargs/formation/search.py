@@ -53,7 +53,7 @@ MAX_TRIES = 4
 
 MAX_ORDER = 3
 """Highest order of a path in time."""
-ORDER_PENALTY = 0.01
+ORDER_PENALTY = 0.005
 """Share of the misfit without any motion that each further order of the path must explain to be preferred."""
 
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
@@ -177,13 +177,14 @@ def _curved(
 ) -> list[FrameMotion]:
     """Return a quadratic and a cubic path next to a straight one; none without a blur.
 
-    ``known`` are those of the level before.
+    ``known`` are those of the level before. A descent begins with the better of the one of its order and the
+    path of the order below.
     """
     paths = [straight]
     if BLUR in _ACTIVE[model] and straight.blur.any():
         for order in range(2, MAX_ORDER + 1):
-            starts = [paths[-1], *known[order - 2 : order - 1]]
-            paths.append(_best(level, starts, model, steps, pose, order))
+            start = min([paths[-1], *known[order - 2 : order - 1]], key=level.cost)
+            paths.append(_best(level, [start], model, steps, pose, order))
     return paths[1:]
 
 
