@@ -90,11 +90,14 @@ def search(
     begun = _best(coarse, starts, models[0], LEVELS[0][1], pose)
     found: list[tuple[Model, FrameMotion]] = [("none", still)]
     for model in models:
-        paths = [_restricted(begun, model)]
+        motion = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
-            straight = _best(level, [paths[0], still], model, steps, pose)
-            paths = [straight, *_curved(level, straight, model, steps, pose, paths[1:])]
-        found += [(model, path) for path in paths]
+            motion = _best(level, [motion, still], model, steps, pose)
+        found.append((model, motion))
+        if BLUR in _ACTIVE[model] and motion.blur.any():
+            for order in range(2, MAX_ORDER + 1):
+                motion = _best(levels[-1], [motion], model, LEVELS[-1][1], pose, order)
+                found.append((model, motion))
     if defocus:
         disc = _sharpest_disc(coarse, still)
         for level in levels[1:]:
@@ -170,22 +173,6 @@ def _best(
     )
     ends = [_descend(level, start, active, steps) for start in starts]
     return min(ends, key=level.cost)
-
-
-def _curved(
-    level: Level, straight: FrameMotion, model: Model, steps: int, pose: bool, known: list[FrameMotion]
-) -> list[FrameMotion]:
-    """Return a quadratic and a cubic path next to a straight one; none without a blur.
-
-    ``known`` are those of the level before. A descent begins with the better of the one of its order and the
-    path of the order below.
-    """
-    paths = [straight]
-    if BLUR in _ACTIVE[model] and straight.blur.any():
-        for order in range(2, MAX_ORDER + 1):
-            start = min([paths[-1], *known[order - 2 : order - 1]], key=level.cost)
-            paths.append(_best(level, [start], model, steps, pose, order))
-    return paths[1:]
 
 
 def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
