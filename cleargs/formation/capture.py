@@ -3,7 +3,8 @@
 The first look at a frame searches it, except in a draft. The next looks follow after every
 `FormationConfig.every` steps on it. They refine its motion with the scene of that time. A test of a few
 milliseconds (`pretest`) says if blur is left that nothing explains, and only then the frame is searched
-again. The sharper the scene becomes, the more blur the test finds.
+again. The sharper the scene becomes, the more blur the test finds. At every fourth look a path of a higher
+order is tried.
 
 Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
 is searched at the first look of a training and at every fourth one, since the test cannot see a skew.
@@ -41,7 +42,8 @@ skewed frames. At a place that few frames see, it hides a skew before `Formation
 DOUBTED = 0.5
 """Weight by RVA below which a frame is doubted."""
 SEARCH_EVERY = 4
-"""Looks at a frame from one search to the next where the shutter rolls."""
+"""Looks at a frame from one try of a higher order to the next, and where the shutter rolls from one search to
+the next."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
@@ -101,6 +103,8 @@ class CaptureFormation:
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
+        estimated = {view.frame_id for view in weighted if view.kind == "real" and view.estimated}
+        self._posed = {"auto": estimated, "on": set(real), "off": set[int]()}[config.pose]
 
     @property
     def exposure(self) -> Exposure | None:
@@ -153,6 +157,7 @@ class CaptureFormation:
                 mask,
                 render,
                 factor=factor,
+                pose=frame_id in self._posed,
                 doubted=self._weights[frame_id] < DOUBTED,
                 rolling=self._rolls(),
                 again=(frame.draws // self._config.every) % SEARCH_EVERY == 0,

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import read_exposure
+from cleargs.formation.frame import from_row
 from cleargs.formation.frames import view_of
+from cleargs.formation.motion import pixel_paths
 from cleargs.formation.table import FORMATION
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_rgb, to_uint8
@@ -181,6 +183,7 @@ def camera_of(frame: Frame) -> Camera:
 
 LAYERS = {
     "observed": "As filmed",
+    "paths": "Paths during the exposure",
     "explained": "Render with camera effects",
     "deblurred": "Deblurred",
     "restored": "Restored",
@@ -197,6 +200,7 @@ IMAGE_BYTES = 8_500_000
 _BYTES_PER_PIXEL = 0.18  # in JPEG files at _QUALITY
 _SIDE_MAX, _SIDE_MIN = 960, 240  # limits of the long side of a layer, px
 _THUMBNAIL, _QUALITY = 240, 84  # long side, px; JPEG quality
+_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # of a drawn path and its border
 
 MAX_RENDERED = 40
 """Maximum number of frames, evenly along the trajectory, for which the final scene is rendered. It limits the
@@ -304,8 +308,8 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
 def _expected_layers(row: FrameRow) -> int:
     """Return how many layers a frame has besides the final scene."""
     if row.selection is not None and row.selection.exr is not None:
-        return 5
-    return 3 if row.modelled else 1
+        return 6 if row.modelled else 5
+    return 4 if row.modelled else 1
 
 
 def _write_frame(
@@ -317,12 +321,32 @@ def _write_frame(
     side: int,
 ) -> FramePictures:
     images = {**layers_of(row, run), **formed}
+    if row.modelled:
+        images["paths"] = with_paths(images["observed"], row)
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
     names = [layer for layer in LAYERS if layer in images]
     layers = {layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side) for layer in names}
     return write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers
+
+
+def with_paths(image: ImageU8, row: FrameRow) -> ImageU8:
+    """Return an image of a frame with the paths of some of its pixels during the exposure, true to scale."""
+    camera = camera_of(row.frame)
+    motion = from_row({**row.formation, "frame_id": row.frame.frame_id}).motion
+    shape = (3, 4) if camera.width >= camera.height else (4, 3)
+    paths = pixel_paths(motion, camera, shape, np.linspace(-0.5, 0.5, 33))
+    rows, columns = np.indices(shape) + 0.5
+    centres = np.stack([columns / shape[1] * camera.width, rows / shape[0] * camera.height], -1)
+    lines = (paths + centres).reshape(len(paths), -1, 2).swapaxes(0, 1)
+    drawn, unit = image.copy(), max(1, round(max(camera.width, camera.height) / 480))
+    fixed = [np.rint(8 * line).astype(np.int32) for line in lines]  # in eighths of a pixel
+    for colour, width in ((_DARK, 3 * unit), (_LIGHT, unit)):
+        cv2.polylines(
+            drawn, fixed, isClosed=False, color=colour, thickness=width, lineType=cv2.LINE_AA, shift=3
+        )
+    return drawn
 
 
 def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from cleargs.base_model import Inherited, Settings
 
@@ -62,7 +62,11 @@ class FormationConfig(Settings):
     every: int = Field(
         10, ge=1, description="training steps on a frame between two estimates of its image formation"
     )
-    pose: bool = Field(False, description="correct the pose of a frame together with its motion")
+    pose: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="correct the pose of a frame together with its motion; auto = where ingest found or "
+        "adjusted the poses, that is, unless those of the input fit within ingest.refine_above",
+    )
     unexplained: float = Field(
         0.0,
         ge=0,
@@ -70,6 +74,11 @@ class FormationConfig(Settings):
         description="difference of colour (sRGB, mean of a neighbourhood, e.g. 0.05) above which unexplained "
         "pixels count less, for captures with moving people or objects; 0 = off",
     )
+
+    @field_validator("pose", mode="before")
+    @classmethod
+    def _pose_was_true_or_false(cls, value: object) -> object:
+        return ("on" if value else "off") if isinstance(value, bool) else value
 
     accept: ClassVar[float] = 0.02
     """Share of a frame's misfit that a model must explain to be accepted (docs/experiments/formation.md)."""
