@@ -26,6 +26,7 @@ from cleargs.evaluate.metrics import (
     fit_affine,
     load_metrics,
     pooled,
+    pooled_psnr,
     region,
 )
 from cleargs.evaluate.references import Reference, ReferenceView, matching
@@ -36,7 +37,7 @@ from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
 from cleargs.progress import Reporter
-from cleargs.splat.backend import rasteriser_for, set_threads
+from cleargs.splat.backend import decibels, rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
@@ -50,6 +51,8 @@ class _Prediction:
     """Image of a method at a reference's view, before colour alignment."""
 
     image: NDArray[np.float64]  # [H, W, 3] sRGB in [0, 1]
+    over_white: NDArray[np.float64] | None = None
+    """The same render over white; None for finished images."""
     refinement: Refinement | None = None
     far: MaskBool | None = None
     """Pixels in which a scene shows something behind the sparse points; None if these are not known."""
@@ -151,11 +154,15 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
     engine = rasteriser_for(scene.gaussians.device)
 
     def render(camera: Camera) -> NDArray[np.float64]:
-        image = engine.forward(
-            scene.gaussians, camera, background=scene.background, antialias=scene.antialias
-        ).image
-        pixels: NDArray[np.float64] = image.numpy().astype(np.float64).clip(0.0, 1.0)
-        return pixels
+        pixels: NDArray[np.float64] = engine.view(scene, camera).image.numpy().astype(np.float64)
+        return pixels.clip(0.0, 1.0)
+
+    def render_twice(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the render over the scene's background, and over white."""
+        image, alpha, _ = engine.view(scene, camera)
+        pixels, through = image.numpy().astype(np.float64), 1.0 - alpha.numpy().astype(np.float64)
+        white = pixels + through[..., None] * (1.0 - np.array(scene.background))
+        return pixels.clip(0.0, 1.0), white.clip(0.0, 1.0)
 
     def depth_and_alpha(camera: Camera) -> tuple[PlaneF32, PlaneF32]:
         rendered = engine.forward(scene.gaussians, camera, antialias=scene.antialias, depth=True)
@@ -172,7 +179,7 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
         farthest = None if points is None else depth_of_points(points, camera)
         if farthest is not None:
             far = far_pixels(*depth_and_alpha(camera), farthest)
-        return _Prediction(render(camera), refinement, far)
+        return _Prediction(*render_twice(camera), refinement, far)
 
     return predict
 
@@ -195,14 +202,14 @@ def _evaluate(
 
     def measured(name: str, prediction: _Prediction, target: ImageU8, mask: MaskBool | None) -> ImageResult:
         image, affine, aligned_psnr = prediction.image, None, None
+        everywhere = np.ones(target.shape[:2], bool)
         fitted = fit_affine(image, target / 255.0, mask)
         aligned = apply_affine(image, fitted)
         if options.align_colour:
             image, affine = aligned, fitted
         else:
-            everywhere = np.ones(target.shape[:2], bool)
             aligned_psnr = region(to_uint8(aligned), target, everywhere, mask).psnr
-        pixels = to_uint8(image)
+        pixels, white = to_uint8(image), prediction.over_white
         if save is not None:
             write_rgb(save / f"{name}.png", pixels)
         return ImageResult(
@@ -214,6 +221,8 @@ def _evaluate(
             reference=_digest(target, mask),
             colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
             psnr_colour_aligned=aligned_psnr,
+            psnr_white=None if white is None else region(to_uint8(white), target, everywhere, mask).psnr,
+            psnr_between=None if white is None else _psnr_between(white, prediction.image),
             refinement=prediction.refinement,
             far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
             clipped=region(pixels, target, clipped_pixels(target), mask),
@@ -245,6 +254,8 @@ def _evaluate(
         options=options,
         means=mean_values(images, options.metrics),
         psnr_colour_aligned=mean_of(image.psnr_colour_aligned for image in images),
+        psnr_white=mean_of(image.psnr_white for image in images),
+        psnr_between=pooled_psnr(image.psnr_between for image in images),
         far=pooled(image.far for image in images),
         clipped=pooled(image.clipped for image in images),
         unavailable=dict(metrics.unavailable),
@@ -256,6 +267,10 @@ def _evaluate(
         },
         images=tuple(images),
     )
+
+
+def _psnr_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return decibels(float(np.square(a - b).sum()), a.size)
 
 
 def _digest(pixels: ImageU8, mask: MaskBool | None = None) -> str:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from cleargs.base_model import Inherited, Settings
+from cleargs.base_model import Inherited, Settings, Unit
 
 # Numbers of steps and Gaussians if the settings leave them unset (measured in docs/experiments/training.md).
 # Steps follow the number of frames, so that each frame is seen often enough. Gaussians follow the number of
@@ -111,6 +111,11 @@ class TrainConfig(Settings):
         gt=0,
         le=1,
         description="end of this training in the schedule, as a fraction",
+    )
+    background: tuple[Unit, Unit, Unit] | None = Field(
+        None,
+        description="sRGB behind the scene; unset = black, and in training a random colour at each step, so "
+        "that what was filmed becomes opaque",
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")
     coarse_share: float = Field(
