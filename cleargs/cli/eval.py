@@ -272,9 +272,8 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
     for evaluation in report.evaluations:
         shown = [(image.name, image.values) for image in evaluation.images] if per_image else []
         for name, values in [*shown, (f"mean of {len(evaluation.images)}", evaluation.means)]:
-            table.add_row(
-                _subject(evaluation), name, *(_figure(metric, values[metric]) for metric in metrics)
-            )
+            figures = (_figure(metric, values[metric]) for metric in metrics)
+            table.add_row(_subject(evaluation), name, *figures)
     console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
     console.print(table)
     for evaluation in report.evaluations:
@@ -287,8 +286,7 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
 
 
 def _subject(evaluation: Evaluation) -> str:
-    refined = ", poses refined" if evaluation.options.refine_poses else ""
-    return f"{evaluation.subject}{refined}"
+    return evaluation.subject + (", poses refined" if evaluation.options.refine_poses else "")
 
 
 def _provenance(evaluation: Evaluation) -> str:
@@ -306,14 +304,15 @@ def _provenance(evaluation: Evaluation) -> str:
 def _regions(evaluation: Evaluation) -> str:
     """Return a line on regions in which scenes often fail."""
     parts = {"behind the sparse points": evaluation.far, "clipped in the references": evaluation.clipped}
-    words = (
+    words = [
         f"{name} {part.share:.1%} of the pixels, {_figure('psnr', part.psnr)} dB"
         for name, part in parts.items()
         if part is not None
-    )
-    white = evaluation.psnr_white, evaluation.psnr_between
-    over = [f"over white {_figure('psnr', white[0])} dB, {_figure('psnr', white[1])} dB from black"]
-    return f"{_subject(evaluation)}: {'; '.join([*words, *(over if white[0] is not None else [])])}"
+    ]
+    if evaluation.psnr_white is not None:
+        between = _figure("psnr", evaluation.psnr_between)
+        words.append(f"over white {evaluation.psnr_white:.2f} dB, {between} dB from black")
+    return f"{_subject(evaluation)}: {'; '.join(words)}"
 
 
 def _figure(metric: str, value: float | None) -> str:

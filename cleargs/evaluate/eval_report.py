@@ -127,10 +127,7 @@ class Evaluation(Figures):
         None, description="Mean of `psnr_colour_aligned` over the images; null if `align_colour` is set."
     )
     psnr_white: float | None = Field(None, description="Mean of `psnr_white` over the images.")
-    psnr_between: float | None = Field(
-        None,
-        description="`psnr_between` of all images together; above 45 dB a viewer's background is hidden.",
-    )
+    psnr_between: float | None = Field(None, description="Mean of `psnr_between` over the images.")
     far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
     clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")

@@ -26,7 +26,6 @@ from cleargs.evaluate.metrics import (
     fit_affine,
     load_metrics,
     pooled,
-    pooled_psnr,
     region,
 )
 from cleargs.evaluate.references import Reference, ReferenceView, matching
@@ -153,12 +152,8 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
     """Return a function that renders a scene at references' views, with poses refined in ``refine_steps``."""
     engine = rasteriser_for(scene.gaussians.device)
 
-    def render(camera: Camera) -> NDArray[np.float64]:
-        pixels: NDArray[np.float64] = engine.view(scene, camera).image.numpy().astype(np.float64)
-        return pixels.clip(0.0, 1.0)
-
-    def render_twice(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the render over the scene's background, and over white."""
+    def render(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the image over the scene's background, and over white."""
         image, alpha, _ = engine.view(scene, camera)
         pixels, through = image.numpy().astype(np.float64), 1.0 - alpha.numpy().astype(np.float64)
         white = pixels + through[..., None] * (1.0 - np.array(scene.background))
@@ -175,11 +170,13 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
             depth, alpha = depth_and_alpha(camera)
             shown = alpha > 0.5
             distance = float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
-            camera, refinement = refine_pose(render, camera, distance, target, mask, refine_steps)
+            camera, refinement = refine_pose(
+                lambda camera: render(camera)[0], camera, distance, target, mask, refine_steps
+            )
         farthest = None if points is None else depth_of_points(points, camera)
         if farthest is not None:
             far = far_pixels(*depth_and_alpha(camera), farthest)
-        return _Prediction(*render_twice(camera), refinement, far)
+        return _Prediction(*render(camera), refinement, far)
 
     return predict
 
@@ -222,7 +219,9 @@ def _evaluate(
             colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
             psnr_colour_aligned=aligned_psnr,
             psnr_white=None if white is None else region(to_uint8(white), target, everywhere, mask).psnr,
-            psnr_between=None if white is None else _psnr_between(white, prediction.image),
+            psnr_between=None
+            if white is None
+            else decibels(float(np.square(white - prediction.image).sum()), white.size),
             refinement=prediction.refinement,
             far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
             clipped=region(pixels, target, clipped_pixels(target), mask),
@@ -255,7 +254,7 @@ def _evaluate(
         means=mean_values(images, options.metrics),
         psnr_colour_aligned=mean_of(image.psnr_colour_aligned for image in images),
         psnr_white=mean_of(image.psnr_white for image in images),
-        psnr_between=pooled_psnr(image.psnr_between for image in images),
+        psnr_between=mean_of(image.psnr_between for image in images),
         far=pooled(image.far for image in images),
         clipped=pooled(image.clipped for image in images),
         unavailable=dict(metrics.unavailable),
@@ -267,10 +266,6 @@ def _evaluate(
         },
         images=tuple(images),
     )
-
-
-def _psnr_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    return decibels(float(np.square(a - b).sum()), a.size)
 
 
 def _digest(pixels: ImageU8, mask: MaskBool | None = None) -> str:

@@ -6,7 +6,7 @@ Sums are exact or taken by numpy in a fixed order, so the figures do not depend 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -18,7 +18,6 @@ from cleargs.evaluate.eval_report import Region
 from cleargs.models.lpips import load_lpips, weights_file
 from cleargs.models.registry import file_digest, model_dir
 from cleargs.models.scorer import Scorer, load_scorer
-from cleargs.splat.backend import decibels
 from cleargs.splat.camera import Camera
 from cleargs.types import ImageF32, ImageU8, MaskBool, PlaneF32
 
@@ -215,17 +214,6 @@ def pooled(parts: Iterable[Region | None]) -> Region | None:
     if not found:
         return None
     share = math.fsum(part.share for part in found)
-    weighted = ((part.psnr, part.share) for part in found if part.psnr is not None)
-    return Region(share=share / len(found), psnr=_of_mean_error(list(weighted)))
-
-
-def pooled_psnr(values: Iterable[float | None]) -> float | None:
-    """Return the PSNR of the mean squared error of images, dB; None if no image has one."""
-    return _of_mean_error([(value, 1.0) for value in values if value is not None])
-
-
-def _of_mean_error(weighted: Sequence[tuple[float, float]]) -> float | None:
-    """Return the PSNR of the mean squared error, from pairs of a PSNR and its weight."""
-    total = math.fsum(weight for _, weight in weighted)
-    error = math.fsum(weight * 10 ** (-value / 10) for value, weight in weighted)
-    return decibels(error, total) if total else None
+    error = math.fsum(part.share * 10 ** (-part.psnr / 10) for part in found if part.psnr is not None)
+    level = None if not share else -10 * math.log10(error / share) if error else math.inf
+    return Region(share=share / len(found), psnr=level)
