@@ -12,6 +12,7 @@ class Stream(IntEnum):
     PSEUDO_VIEWS = 1
     REFINEMENT = 2
     POSITION_NOISE = 3
+    BACKGROUND = 4
     RIVR = 5
     CONSOLIDATION = 6
     ADDED_POINTS = 100

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from cleargs.base_model import Unit
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
 from cleargs.splat.config import INIT_OPACITY, INIT_SCALE, TrainConfig
@@ -47,7 +46,6 @@ class G0Config(TrainConfig):
         "more than 5 %",
     )
     antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
-    background: tuple[Unit, Unit, Unit] = Field((0.0, 0.0, 0.0), description="sRGB behind the scene")
     min_points: int = Field(
         10_000,
         ge=1,
@@ -64,7 +62,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 26
+VERSION = 27
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -123,7 +121,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.splat.budget import resolve_config
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.ply import write_ply
-    from cleargs.splat.scene import Scene
+    from cleargs.splat.scene import BLACK, Scene
     from cleargs.splat.state import save_state
     from cleargs.splat.tables import TRAIN
     from cleargs.splat.trainer import Trainer
@@ -157,7 +155,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
         draft=config.quality == "draft",
     )
     trainer = Trainer(
-        Scene(gaussians, config.antialias, config.background),
+        Scene(gaussians, config.antialias, config.background or BLACK),
         views,
         config,
         seed=(context.seed,),

@@ -49,6 +49,7 @@ CONFIG = TrainConfig(
     lr_sh=2e-3,
     opacity_reg=0.0,
     scale_reg=0.0,
+    background=(0.0, 0.0, 0.0),  # the wall has gaps
 )
 LOOK = FormationConfig(start=0.0, every=4)
 BLURRED = 2
