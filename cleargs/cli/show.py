@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 MAX_LISTED = 16  # items of a list that are printed
 MAX_COUNTED = 12  # distinct words in a column whose numbers are printed one by one
 MAX_NAME_LENGTH = 14  # characters of a frame's name in a table
-MIN_FAULT = 0.2  # smaller distances of a cue from its best value are not reported
 LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; width in px
-PLOT = "rva-plot.png"  # default file of --plot in the run folder
 HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
 
 LABELS: Mapping[str, str] = {
@@ -97,7 +95,6 @@ Examples:
   cleargs show room rva             role and weight of each frame, and why
   cleargs show room rva --columns   the columns of the tables, with their meanings
   cleargs show room g0 --rows 5     rows of each table, evenly spaced
-  cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
   cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
 )
@@ -108,11 +105,6 @@ Examples:
 )
 @click.option("--columns", is_flag=True, help="Describe the tables column by column.")
 @click.option(
-    "--plot",
-    is_flag=True,
-    help="For rva: draw trajectory, scores, roles, weights, and the best and worst frames.",
-)
-@click.option(
     "--frame",
     type=click.IntRange(min=0),
     metavar="N",
@@ -122,7 +114,7 @@ Examples:
     "-o",
     "--output",
     type=FILE,
-    help=f"File of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
+    help="File of --frame (.png).  [default: RUN/frame-N.png]",
 )
 @json_option
 @click.pass_obj
@@ -132,22 +124,20 @@ def show(
     stage: str | None,
     rows: int | None,
     columns: bool,
-    plot: bool,
     frame: int | None,
     output: Path | None,
     as_json: bool,
 ) -> None:
     """Show the results of the stages of RUN, or the tables of one STAGE."""
-    draws = output is not None and output.suffix.lower() == ".png" and (plot or frame is not None)
+    draws = output is not None and output.suffix.lower() == ".png" and frame is not None
     for cause, wrong, example in (
-        ("--plot needs the stage rva", plot and stage != "rva", "rva --plot"),
         ("--frame cannot be used with a stage", frame is not None and stage is not None, f"--frame {frame}"),
         (
             "--rows and --columns need the name of a stage",
             stage is None and (columns or rows is not None),
             "rva --columns",
         ),
-        ("--output needs --plot or --frame, and a .png file", output and not draws, "rva --plot -o FILE.png"),
+        ("--output needs --frame, and a .png file", output and not draws, "--frame 3 -o FILE.png"),
     ):
         if wrong:
             raise InputError(cause, hint=f"cleargs show {run} {example}")
@@ -162,12 +152,6 @@ def show(
             _print_run(settings, {name: done.get(name) for name in dag.names})
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
-    elif plot:
-        from cleargs.report.allocation_picture import plot_allocation
-
-        picture = output or run / PLOT
-        plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
-        answer(as_json, {"stage": stage, "plot": str(picture)}, f"written: {picture}")
     else:
         _show_stage(run, done, stage, rows, columns, as_json)
 
@@ -332,6 +316,8 @@ def frame_rows(
         settings: The settings of RVA that made these rows.
         repairs: The rows of ``rivr/selection.parquet``; None before RIVR, when frames have no "repair".
     """
+    from cleargs.report.frames import worst_cue
+
     latest = {row["frame_id"]: row for row in sorted(repairs or (), key=lambda row: int(row["round"]))}
     found = []
     for row in rows:
@@ -347,16 +333,6 @@ def short_name(name: str) -> str:
     """Return the end of a frame's name, which differs most between frames."""
     last = name.rpartition("/")[2]
     return last if len(last) <= MAX_NAME_LENGTH else f"…{last[1 - MAX_NAME_LENGTH :]}"
-
-
-def worst_cue(row: Mapping[str, Any]) -> str:
-    """Return the cue farthest from its best value, as "motion blur 0.82"; "" if all are good."""
-    off = {name: 1.0 - value for name, value in row.items() if name.startswith("r_") and value is not None}
-    off |= {name: value for name, value in row.items() if name.startswith("b_") and value is not None}
-    worst = max(off, key=lambda name: off[name], default="")
-    if not worst or off[worst] < MIN_FAULT:
-        return ""
-    return f"{worst[2:].replace('_', ' ')} {row[worst]:.2f}"
 
 
 def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
@@ -405,7 +381,7 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
 
     Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
-    from cleargs.report.frames import MEANINGS, camera_of, load_rows
+    from cleargs.report.frames import MEANINGS, camera_of, load_rows, worst_cue
     from cleargs.rivr.tables import REPAIRS
 
     if "ingest" not in done:
