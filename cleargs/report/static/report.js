@@ -5,6 +5,9 @@ const NAMES = {
   D: "D, pose diversity", O: "O, redundancy", Z: "Z, centrality in its bin",
 };
 
+// Files next to the folder of the report are not there in a report that is one file or comes from a server.
+if (location.protocol !== "file:") document.documentElement.dataset.single = "";
+
 // -- the data of a frame ------------------------------------------------------------------------------------
 const cues = (frame) => {
   const entries = Object.entries(frame.cues);
