@@ -60,15 +60,6 @@ LABELS: Mapping[str, str] = {
 OVERVIEW = ("frames", "registered", "test", "points", "roles", "gaussians", "psnr_unseen", "repairs")
 """Figures in the overview of a run, which also names the ``published`` scene."""
 
-MODELS = {
-    "none": "nothing found",
-    "blur": "motion blur",
-    "skew": "rolling shutter",
-    "both": "motion blur and rolling shutter",
-    "defocus": "defocus",
-}
-"""Model of a frame's image formation -> its name."""
-
 SOURCES = {
     "observation": "the frame as filmed",
     "deblurred": "the deblurred frame",
@@ -445,7 +436,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
 def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
     """Yield label and text of each line about a frame."""
-    from cleargs.report.frames import CHOICES, scores_of
+    from cleargs.report.frames import CHOICES, EFFECTS, scores_of
 
     frame, judged = row.frame, facts["rva"]
     yield "file", frame.name
@@ -477,12 +468,11 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple
     if row.gain_ev is not None:
         yield "exposure", f"{row.gain_ev:+.2f} stops relative to the scene"
     if found := row.formation:
-        model = MODELS.get(found["model"], found["model"])
         if found["model"] == "none":
-            yield "formation", model
+            yield "formation", "nothing found"
         else:
             share = f"{100 * found['explained']:.0f} %"
-            yield "formation", f"{model}, explains {share} of the misfit"
+            yield "formation", f"{EFFECTS[found['model']][0]}, explains {share} of the misfit"
             lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
             yield "", ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
         yield (

@@ -49,30 +49,24 @@ class Advice(NamedTuple):
     """Order of the advice: the expected gain in dB, or a judgement in its place."""
     options: tuple[str, ...] = ()
     """Options of ``cleargs run``; empty if no command helps."""
-
-
-class Shown(NamedTuple):
-    """Advice as the page shows it."""
-
-    advice: Advice
-    command: str
-    time: str
+    command: str = ""
+    time: str = ""
     """Expected time of the command; "" without a command or an estimate."""
 
 
 def shown_advice(
     planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
-) -> list[Shown]:
+) -> list[Advice]:
     """Return all advice on a run, the most useful first. Holding out frames is never the only command."""
     found = sorted(_Advisor(planner, manifests, rows).advice(), key=lambda advice: -advice.worth)
     if not any(advice.options and advice.worth for advice in found):
         found = [advice for advice in found if advice.worth]
     return [
-        Shown(
-            advice,
-            shlex.join([*_base(planner.run), *advice.options]) if advice.options else "",
-            _time(planner, advice.options) if advice.options else "",
+        advice._replace(
+            command=shlex.join([*_base(planner.run), *advice.options]), time=_time(planner, advice.options)
         )
+        if advice.options
+        else advice
         for advice in found
     ]
 
@@ -202,21 +196,12 @@ class _Advisor:
         lower = {"rva.tau_R": round(max(self._setting("rva", "tau_R") - 0.1, 0.0), 2)}
         if self._figure("rva", "stand_in"):
             higher = {"rva.tau_B": round(min(self._setting("rva", "tau_B") + 0.1, 1.0), 2)}
-            yield Advice(
-                "No frame counts as reliable",
-                "The best frames are used instead. Thresholds closer to the scores of this capture would "
-                "separate good frames from bad frames.",
-                NO_FIGURE,
-                0.3,
-                tuple(_set(lower | higher)),
-            )
+            what = "No frame counts as reliable, so the best ones are used"
+            why = "Thresholds closer to the scores of this capture separate good frames from bad ones."
+            yield Advice(what, why, NO_FIGURE, 0.3, tuple(_set(lower | higher)))
         if uncovered := self._figure("rva", "bins_uncovered_before"):
-            yield Advice(
-                f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame",
-                "The scene may be softer there. Film more slowly there.",
-                NO_FIGURE,
-                0.2,
-            )
+            what = f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame"
+            yield Advice(what, "The scene may be softer there. Film more slowly there.", NO_FIGURE, 0.2)
         weighted = sum(row.weight is not None for row in self._placed)
         unused = sum(row.weight == 0.0 for row in self._placed)
         if weighted and unused > MANY_UNUSED * weighted:
@@ -233,55 +218,38 @@ class _Advisor:
         yield from self._on_steps()
         spread = self._figure("g0", "exposure_spread") or 0.0
         if spread > self._setting("g0", "exposure_threshold") and not self._figure("g0", "exposure"):
-            yield Advice(
-                f"Exposure differs by {100 * spread:.0f} % between frames",
-                "Without compensation the scene averages the exposures, which causes floating haze.",
-                NO_FIGURE,
-                0.8,
-                tuple(_set({"g0.exposure": "auto"})),
-            )
-        for stage in ("rivr", "consolidate"):
-            if harm := self._figure(stage, "held_back", "harm"):
-                yield Advice(
-                    f"The scene of {stage} was rejected",
-                    f"It matches frames without repairs worse than the scene before ({harm}), which is kept.",
-                    NO_FIGURE,
-                    0.1,
-                )
+            what = f"Exposure differs by {100 * spread:.0f} % between frames"
+            why = "Without compensation the scene averages the exposures, which causes floating haze."
+            yield Advice(what, why, NO_FIGURE, 0.8, tuple(_set({"g0.exposure": "auto"})))
 
     def _on_steps(self) -> Iterator[Advice]:
         """Yield advice on the length of the training and the size of the images."""
-        config, active = self._setting, sum(bool(row.weight) for row in self._rows)
-        steps, quality = self._figure("g0", "steps") or 0, config("g0", "quality")
-        standard = steps_from_frames(active)
+        steps, quality = self._figure("g0", "steps") or 0, self._setting("g0", "quality")
+        standard = steps_from_frames(sum(bool(row.weight) for row in self._rows))
+        size = self._setting("ingest", "max_size")
         recipe, changed = _nearest_recipe(self._config, self._dag)
-        named = config("g0", "steps") is not None or recipe != "default"
-        own = {name: value for name, value in changed.items() if name.startswith(("ingest.", "rva."))}
-        reset = ("--reset", *_set(own)) if named else ()
+        named = self._setting("g0", "steps") is not None or recipe != "default"
         if steps < SHORT * standard:
+            own = {name: value for name, value in changed.items() if name.startswith(("ingest.", "rva."))}
+            reset = ("--reset", *_set(own)) if named else ()
             yield Advice(
-                f"The training was short: {steps:,} of {standard:,} steps"
-                + (f" at {config('ingest', 'max_size')} px" if recipe == "smoke" else ""),
+                f"The training was short: {steps:,} of {standard:,} steps at {size} px",
                 "Longer training gives finer detail.",
                 "+0.8 to 2.2 dB at new views (draft against standard, four captures)",
                 1.5,
                 (*reset, "--quality", "standard"),
             )
-        elif quality == "standard":
+        elif quality == "standard" and not named:
             yield Advice(
                 "The training can be longer",
                 "High quality takes four times the steps and twice the Gaussians.",
                 "+0.4 to 0.9 dB at new views on three captures, none on a fourth",
                 0.6,
-                (*reset, "--quality", "high"),
+                ("--quality", "high"),
             )
-        sides = [max(row.frame.width, row.frame.height) for row in self._rows]
-        size = config("ingest", "max_size")
-        if steps >= SHORT * standard and sides and max(sides) == size:
-            yield Advice(
-                f"Images were reduced to {size} px",
-                "Larger images show finer detail, if the video has it.",
-                NO_FIGURE,
-                0.5,
-                tuple(_set({"ingest.max_size": size * 3 // 2})),
-            )
+        if steps >= SHORT * standard and any(
+            size in (row.frame.width, row.frame.height) for row in self._rows
+        ):
+            why = "Larger images show finer detail, if the video has it."
+            larger = tuple(_set({"ingest.max_size": size * 3 // 2}))
+            yield Advice(f"Images were reduced to {size} px", why, NO_FIGURE, 0.5, larger)

@@ -91,11 +91,12 @@ class FrameRow:
     @property
     def weight(self) -> float | None:
         """Weight with which the raw frame taught at the end, from 0 to 1; None if it is unknown."""
-        return self.formation.get("weight_after", self.judged.get("weight"))
+        weight: float | None = self.formation.get("weight_after", self.judged.get("weight"))
+        return weight
 
     @property
     def teaching(self) -> str:
-        """How much the raw frame counted in training, and why."""
+        """The weight of the raw frame in words, with its reason; "" if it is unknown."""
         if self.role in (UNPLACED, HELD_OUT):
             return f"{self.role}: not used"
         if self.weight is None:
@@ -383,7 +384,7 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     if row.moving is not None:
         unused = read_rgb(run / row.moving).max(axis=2) == 0
         tint = np.where(unused[..., None], _UNUSED, images["observed"]).astype(np.uint8)
-        images["moving"] = cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0)
+        images["moving"] = np.asarray(cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0), np.uint8)
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}

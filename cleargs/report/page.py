@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
-from matplotlib.ticker import MaxNLocator
 from rich.filesize import decimal
 
 import cleargs
@@ -159,8 +158,6 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             viewer=viewer,
             licence=(folder / LICENCE).read_text(encoding="utf-8") if viewer else "",
             size=single_file_size(folder),
-            curves=training_curves(run, trained),
-            worst=worst_frames(frames),
             stages=planner.dag.names,
             manifests=manifests,
             plans=plans,
@@ -176,6 +173,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
                 "start": opening_frame(placed).frame.frame_id if scene else None,
                 "frames": frames,
                 "viewer": settings,
+                "training": training_curves(run, trained),
             },
         )
         write_report_json(folder, manifests, last)
@@ -263,55 +261,31 @@ def frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> di
     }
 
 
-def worst_frames(frames: Sequence[dict[str, Any]], most: int = 5) -> list[dict[str, Any]]:
-    """Return the frames that the scene matches worst, by PSNR, the worst first."""
-    return sorted((frame for frame in frames if frame["psnr"] is not None), key=lambda f: f["psnr"])[:most]
-
-
-# -- SVG paths of curves -------------------------------------------------------------------------------------
-
-
 _POINTS = 120  # maximum number per curve
 
 
-def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the curves of loss, PSNR and number of Gaussians over the training steps.
+def training_curves(run: Path, stages: Sequence[str]) -> dict[str, Any] | None:
+    """Return loss, PSNR and number of Gaussians over the training steps; None before the first step.
 
-    Loss and PSNR are those of raw frames. Positions of ticks, and of the starts of the trainings (``parts``),
-    are in percent of the drawing area. Raises StoreError if a table cannot be read.
+    Loss and PSNR are those of raw frames: medians over equal intervals, since each step shows one view, and
+    views differ more than steps. Raises StoreError if a table cannot be read.
     """
-    paths = {stage: run / stage / "train.parquet" for stage in stages}
-    tables = {stage: read_table(path, TRAIN) for stage, path in paths.items() if path.is_file()}
-    tables = {stage: table for stage, table in tables.items() if table.num_rows}
-    if not tables:
-        return []
-    steps = pa.concat_tables(tables.values())
+    paths = [(stage, run / stage / "train.parquet") for stage in stages]
+    tables = {stage: read_table(path, TRAIN) for stage, path in paths if path.is_file()}
+    steps = pa.concat_tables([TRAIN.empty_table(), *tables.values()])
     real = np.array(steps["kind"].to_pylist()) == "real"
-    starts = np.cumsum([0, *(table.num_rows for table in tables.values())])
-    parts = [(start / len(real) * 100, stage) for start, stage in zip(starts, tables, strict=False)]
-
-    def curve(title: str, unit: str, name: str, digits: int, *, only_real: bool) -> dict[str, Any]:
+    if not real.any():
+        return None
+    curves: list[dict[str, Any]] = []
+    for title, unit, name, digits in (
+        ("PSNR on training frames", "dB", "psnr", 1),
+        ("Loss", "", "loss", 3),
+        ("Gaussians", "", "n_gaussians", 0),
+    ):
         values = steps[name].to_numpy().astype(np.float64)
-        known = np.flatnonzero(real & np.isfinite(values)) if only_real else np.arange(len(values))
-        # Medians over equal intervals: each step shows one view, and views differ more than steps.
+        known = np.flatnonzero(real & np.isfinite(values))
         intervals = np.array_split(known, min(_POINTS, max(1, len(known) // 6)))
-        x = np.array([part.mean() for part in intervals]) / max(len(values) - 1, 1) * 100
-        y = np.array([np.median(values[part]) for part in intervals])
-        ticks = MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)).tick_values(float(y.min()), float(y.max()))
-        down = np.interp(y, (ticks[0], ticks[-1]), (100.0, 0.0))
-        return {
-            "title": title,
-            "unit": unit,
-            "path": "M" + " L".join(f"{a:.2f},{b:.2f}" for a, b in zip(x, down, strict=True)),
-            "ticks": list(zip(np.linspace(100.0, 0.0, len(ticks)), (f"{t:,g}" for t in ticks), strict=True)),
-            "parts": parts,
-            "steps": len(values),
-            "first": f"{y[0]:,.{digits}f}",
-            "last": f"{y[-1]:,.{digits}f}",
-        }
-
-    return [
-        curve("PSNR on training frames", "dB", "psnr", 1, only_real=True),
-        curve("Loss", "", "loss", 3, only_real=True),
-        curve("Gaussians", "", "n_gaussians", 0, only_real=False),
-    ]
+        points = [(float(part.mean()), float(np.median(values[part]))) for part in intervals]
+        curves.append({"title": title, "unit": unit, "digits": digits, "points": points})
+    starts = np.cumsum([0, *(table.num_rows for table in tables.values())]).tolist()
+    return {"steps": len(real), "parts": list(zip(tables, starts, strict=False)), "curves": curves}

@@ -20,6 +20,12 @@ good scene depends on the noise and the texture of the capture."""
 
 Tone = Literal["good", "fair", "poor"]
 
+HEADLINES: Mapping[Tone, str] = {
+    "good": "Good: the scene matches the video closely.",
+    "fair": "Fair: the scene matches the video reasonably well.",
+    "poor": "Poor: the scene matches the video only loosely.",
+}
+
 FIGURES = (
     ("psnr_unseen", "PSNR on pixels that no training used"),
     ("psnr_strong", "PSNR on the best training frames"),
@@ -56,17 +62,13 @@ def verdict(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen:
         unseen: PSNR, dB, of each frame that was held out.
     """
     psnr, meaning = _headline_figure(manifests)
-    figure = "" if psnr is None else f"{psnr:.1f}"
     text = _text(manifests, rows, unseen)
-    if "g0" not in manifests:
-        return Verdict("fair", "The capture is prepared. No scene is trained yet.", text, figure, meaning)
     if psnr is None:
-        return Verdict("fair", "The scene is trained.", text, figure, meaning)
-    if psnr >= CLOSE_DB:
-        return Verdict("good", "Good: the scene matches the video closely.", text, figure, meaning)
-    if psnr >= LOOSE_DB:
-        return Verdict("fair", "Fair: the scene matches the video reasonably well.", text, figure, meaning)
-    return Verdict("poor", "Poor: the scene matches the video only loosely.", text, figure, meaning)
+        trained = "g0" in manifests
+        headline = "The scene is trained." if trained else "The capture is prepared. No scene is trained yet."
+        return Verdict("fair", headline, text, "", "")
+    tone: Tone = "good" if psnr >= CLOSE_DB else "fair" if psnr >= LOOSE_DB else "poor"
+    return Verdict(tone, HEADLINES[tone], text, f"{psnr:.1f}", meaning)
 
 
 def _headline_figure(manifests: Mapping[str, Manifest]) -> tuple[float | None, str]:
@@ -88,6 +90,8 @@ def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: S
     repaired = figure_of(manifests, "consolidate", "repairs")
     if repaired is not None:
         parts.append(f"{repaired} repaired")
+    if any(figure_of(manifests, stage, "held_back", "harm") for stage in SCENES):
+        parts.append("a scene with repairs was rejected, since it matched other frames worse")
     if unseen:
         held = f"{count(len(unseen), 'frame')} that {'was' if len(unseen) == 1 else 'were'} held out"
         parts.append(f"{fmean(unseen):.1f} dB at {held}, with aligned colours")

@@ -21,14 +21,14 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
-from cleargs.report.advice import Shown, shown_advice
+from cleargs.report.advice import Advice, shown_advice
 from cleargs.report.frames import FrameRow, load_rows
 from cleargs.report.report_json import linked_manifests
 
 SIZE = 64
 
 
-def advice(tmp_path: Path, rows: Any, manifests: Any, *settings: str) -> list[Shown]:
+def advice(tmp_path: Path, rows: Any, manifests: Any, *settings: str) -> list[Advice]:
     """Advice on a run with these settings, whose capture does not exist."""
     config = load_config(installed(), "default", settings)
     run = RunSpec(tmp_path / "run", tmp_path / "clip.mp4", config, tmp_path / "store", "cpu")
@@ -84,8 +84,8 @@ def test_a_short_training_gets_the_command_for_a_longer_one(
 ) -> None:
     manifests = ingest(40) | {"g0": SimpleNamespace(summary={"steps": steps, "exposure": True}, missing=())}
     found = advice(tmp_path, [frame() for _ in range(40)], manifests, *settings)
-    assert found[0].command == f"cleargs run clip.mp4 -o run {options}" and " dB" in found[0].advice.gain
-    worths = [shown.advice.worth for shown in found]
+    assert found[0].command == f"cleargs run clip.mp4 -o run {options}" and " dB" in found[0].gain
+    worths = [shown.worth for shown in found]
     assert worths == sorted(worths, reverse=True)
 
 

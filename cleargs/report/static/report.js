@@ -61,6 +61,45 @@ const describe = (frame) => {
   };
 };
 
+// -- the curves of the training: labels are HTML, so that their size does not follow that of the drawing ---------
+{
+  const shape = (parent, name, attributes) => {
+    const element = parent.appendChild(document.createElementNS("http://www.w3.org/2000/svg", name));
+    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+    return element;
+  };
+  const { steps, parts, curves } = report.training ?? { curves: [] };
+  for (const { title, unit, digits, points } of curves) {
+    const values = points.map(([, value]) => value);
+    const [least, most] = [Math.min(...values), Math.max(...values)];
+    const power = 10 ** Math.floor(Math.log10((most - least) / 4 || 1));
+    const gap = [1, 2, 2.5, 5, 10].map((factor) => factor * power).find((size) => size * 4 >= most - least);
+    const [low, high] = [Math.floor(least / gap) * gap, Math.max(Math.ceil(most / gap), Math.floor(least / gap) + 1) * gap];
+    const y = (value) => (100 * (high - value)) / (high - low);
+    const text = (value) => value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+    const [from, to] = [text(values[0]), `${text(values[values.length - 1])} ${unit}`.trim()];
+    const figure = make("figure", undefined, "chart");
+    const caption = figure.appendChild(make("figcaption"));
+    caption.append(make("span", title), make("b", to), make("small", `from ${from}, over ${steps.toLocaleString("en")} steps`));
+    const plot = figure.appendChild(make("div", undefined, "plot"));
+    const label = `${title}: from ${from} to ${to} over ${steps} steps`;
+    const svg = shape(plot, "svg", { viewBox: "0 0 100 100", preserveAspectRatio: "none", role: "img", "aria-label": label });
+    for (let value = low; value <= high + gap / 2; value += gap) {
+      shape(svg, "line", { class: "grid", x1: 0, x2: 100, y1: y(value), y2: y(value) });
+      const tick = make("span", Number(value.toPrecision(6)).toLocaleString("en"), "tick");
+      plot.append(Object.assign(tick, { style: `top: ${y(value)}%` }));
+    }
+    for (const [stage, start] of parts) {
+      const x = (100 * start) / steps;
+      if (start > 0) shape(svg, "line", { class: "part", x1: x, x2: x, y1: 0, y2: 100 });
+      plot.append(Object.assign(make("span", stage, "part-name"), { style: `left: ${x}%` }));
+    }
+    const path = points.map(([step, value]) => `${((100 * step) / steps).toFixed(2)},${y(value).toFixed(2)}`);
+    shape(svg, "path", { class: "line", d: `M${path.join(" L")}` });
+    one("#curves").append(figure);
+  }
+}
+
 // -- the timeline: a lane of bars per figure, and a scrubber over all ----------------------------------------
 {
   const LANES = [
