@@ -28,7 +28,7 @@ from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
 from cleargs.splat.camera import Camera
 from cleargs.splat.render import Viewer
 from cleargs.splat.tables import TRAIN
-from cleargs.types import ImageU8
+from cleargs.types import ImageU8, MaskBool
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles, on the page, of frames that RVA does not rate."""
@@ -51,9 +51,6 @@ EFFECTS = {
 
 MIN_FAULT = 0.2
 """Smaller faults of a frame are not reported."""
-
-MOVING = "moving"
-"""Folder of a scene with a mask per frame, ``<frame_id>.png``, of what moves in it."""
 
 LAST_STEPS = 3
 """Number of the last training steps on a frame whose PSNR is shown as that of the frame."""
@@ -78,8 +75,8 @@ class FrameRow:
     psnr: float | None = None
     """Median PSNR, dB, of the last training steps on the raw frame, as its camera saw it; None if no training
     used the frame."""
-    moving: str | None = None
-    """Path, in the run folder, of the mask of what moves in the frame (0 = not used); None without one."""
+    moving: MaskBool | None = None  # [rows, columns]
+    """Cells of the frame, which divide it evenly, that the training left out because something moves there."""
 
     @property
     def role(self) -> str:
@@ -210,10 +207,13 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     psnr = _last_psnr([run / stage / "train.parquet" for stage in SCENES if stage in stages])
     affines: dict[int, NDArray[np.float64]] = {}
     formation: dict[int, dict[str, Any]] = {}  # stays empty if image formation is off
-    moving: dict[int, str] = {}
+    moving: dict[int, MaskBool] = {}
     if final := last_scene(stages):
-        files = sorted((run / final / MOVING).glob("*.png"))
-        moving = {int(file.stem): f"{final}/{MOVING}/{file.name}" for file in files if file.stem.isdigit()}
+        if (path := run / final / "movement.parquet").is_file():
+            for row in read_any_table(path).to_pylist():
+                shape = row["rows"], row["columns"]
+                bits = np.unpackbits(np.frombuffer(row["moves"], np.uint8), count=shape[0] * shape[1])
+                moving[row["frame_id"]] = bits.reshape(shape) > 0
         exposure = read_exposure(run / final / "exposure.parquet")
         if exposure.enabled:
             affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
@@ -382,8 +382,9 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     """
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.moving is not None:
-        unused = read_rgb(run / row.moving).max(axis=2) == 0
-        tint = np.where(unused[..., None], _UNUSED, images["observed"]).astype(np.uint8)
+        height, width = images["observed"].shape[:2]
+        cells = cv2.resize(row.moving.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        tint = np.where(cells[..., None] > 0, _UNUSED, images["observed"]).astype(np.uint8)
         images["moving"] = np.asarray(cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0), np.uint8)
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")

@@ -12,8 +12,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
-import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
@@ -271,10 +272,9 @@ def test_held_out_frames_have_a_psnr_too(tmp_path: Path) -> None:
 
 def test_what_moves_in_a_frame_is_a_layer(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
-    mask = np.full((54, 96), 255, np.uint8)
-    mask[:, :48] = 0
-    (run.folder / "consolidate/moving").mkdir()
-    cv2.imwrite(str(run.folder / "consolidate/moving/000002.png"), mask)
+    cells = np.arange(32) % 8 < 4  # the left half of 4 rows of 8 cells
+    moves = {"frame_id": [2], "rows": [4], "columns": [8], "moves": [np.packbits(cells).tobytes()]}
+    pq.write_table(pa.table(moves), run.folder / "consolidate/movement.parquet")
     row = load_rows(run.folder, linked_manifests(run.folder, run.dag.names))[2]
     layers = layers_of(row, run.folder)
     change = np.abs(layers["moving"].astype(int) - layers["observed"]).max(axis=2)
