@@ -76,7 +76,7 @@ class FrameRow:
     """Median PSNR, dB, of the last training steps on the raw frame, as its camera saw it; None if no training
     used the frame."""
     moving: MaskBool | None = None  # [rows, columns]
-    """Cells of the frame, which divide it evenly, that the training left out because something moves there."""
+    """Cells, which divide the frame evenly, that the training left out since something moves there."""
 
     @property
     def role(self) -> str:

@@ -51,13 +51,7 @@ from cleargs.report.report_json import (
 )
 from cleargs.report.single_file import single_file_size
 from cleargs.report.verdict import verdict
-from cleargs.report.web_scene import (
-    LICENCE,
-    opening_frame,
-    viewer_data,
-    write_scene,
-    write_viewer,
-)
+from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.render import Viewer
