@@ -121,7 +121,8 @@ def _time(planner: Planner, options: Sequence[str]) -> str:
     kept = "default" if "--reset" in options else planner.run.config.document()
     try:
         config = load_config(planner.dag, kept, given)
-        changed = replace(planner, run=replace(planner.run, config=config), reporter=SilentReporter())
+        run = replace(planner.run, config=config)
+        changed = Planner(planner.dag, run, planner.store, planner.threads, SilentReporter())
         costs = [plan.estimate.minutes for plan in changed.plan() if plan.estimate is not None]
     except CleargsError:  # the capture was deleted or moved
         return ""
