@@ -19,6 +19,7 @@ import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
+from cleargs.cli.main import invoke
 from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
@@ -279,3 +280,16 @@ def test_what_moves_in_a_frame_is_a_layer(tmp_path: Path) -> None:
     layers = layers_of(row, run.folder)
     change = np.abs(layers["moving"].astype(int) - layers["observed"]).max(axis=2)
     assert (change[:, 48:] <= 1).all() and (change[:, :48] > 10).mean() > 0.9
+
+
+def test_the_command_writes_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = FinishedRun(tmp_path).folder
+    assert invoke(["report", str(run), "-o", str(tmp_path / "a.html")]) == 2
+    assert "--single-file" in capsys.readouterr().err and not (tmp_path / "a.html").exists()
+    assert invoke(["report", str(run), "-q", "--single-file"]) == 0
+    file = run / "run-report.html"
+    assert f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)" in capsys.readouterr().out
+    assert (run / "report.html").is_file()
+    assert invoke(["report", str(run), "--single-file", "--json", "-o", str(tmp_path / "a.html")]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["bytes"] == (tmp_path / "a.html").stat().st_size
