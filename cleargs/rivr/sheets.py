@@ -34,10 +34,7 @@ def write_before_after_sheet(
     repairs: Mapping[int, Selection],
     rivr: Path,
 ) -> None:
-    """Write one line per view: G0's render, the final render and the observation.
-
-    If any of the views has a repair that was distilled, there is a column for it.
-    """
+    """Write one line per view: G0's render, the final render, the observation and any distilled repair."""
     repaired = any(view.frame_id in repairs for view in views)
     lines = []
     for view in views:
