@@ -74,7 +74,7 @@ def shown_advice(
 def command(run: RunSpec, dag: Dag) -> str:
     """Return the ``cleargs run`` command that reproduces a run, to be called next to its folder."""
     recipe, changed = _nearest_recipe(run.config, dag)
-    words = [*_base(run), *(["--workflow", recipe] if recipe != "default" else [])]
+    words = [*_base(run), *(["--recipe", recipe] if recipe != "default" else [])]
     words += ["--seed", str(changed.pop("seed"))] if "seed" in changed else []
     return shlex.join(words + _set(changed))
 

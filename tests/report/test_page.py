@@ -10,7 +10,7 @@ from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import pyarrow as pa
@@ -23,7 +23,7 @@ from cleargs.cli.main import invoke
 from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
-from cleargs.manifest import linked_manifest, write_manifest
+from cleargs.manifest import Manifest, linked_manifest, write_manifest
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
 from cleargs.report.advice import command
@@ -34,7 +34,7 @@ from cleargs.report.page import (
     json_in_html,
     write_report,
 )
-from cleargs.report.report_json import LastRun, is_current, linked_manifests
+from cleargs.report.report_json import LastRun, cameras_of, is_current, linked_manifests
 from cleargs.report.single_file import single_file_size, write_single_file
 from cleargs.report.web_scene import SCENE_BYTES, shown_degree, write_scene
 from cleargs.rivr.tables import Selection
@@ -47,6 +47,24 @@ def test_a_frame_that_was_not_tried_says_why() -> None:
     data = frame_data(row, FramePictures(ImageFile("a.jpg", 1, 1), {}, None), None)
     assert (data["repair"], data["why"], data["scores"]) == ("kept as filmed", reason, {})
     assert data["chosen"] is None, "a frame that is kept as filmed has no repair that won"
+
+
+@pytest.mark.parametrize(
+    ("poses", "errors", "expected"),
+    [
+        ("input", None, ("given", None, None)),
+        ("input", {"given": 0.9, "adjusted": 0.8}, ("given", 0.9, 0.9)),
+        ("refined", {"given": 1.7, "adjusted": 0.3}, ("adjusted", 1.7, 0.3)),
+        ("sfm", {"given": 1.7, "adjusted": 0.6, "sfm": 0.3}, ("sfm over given", 1.7, 0.3)),
+        ("sfm", None, ("sfm", None, None)),
+    ],
+)
+def test_the_report_says_how_cameras_were_placed(poses: str, errors: Any, expected: tuple[Any, ...]) -> None:
+    lenses = [{"lens": "OPENCV", "focal_px": 518.0, "frames": 96}]
+    summary = {"poses": poses, "kept_out_matches_off_px": errors, "cameras": lenses, "placed": {"given": 96}}
+    found = cameras_of({"ingest": cast(Manifest, SimpleNamespace(summary=summary))})
+    assert tuple(found[name] for name in ("method", "off_px_before", "off_px")) == expected
+    assert found["lenses"] == lenses and cameras_of({}) == {}
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +137,7 @@ def test_settings_and_the_command_make_the_run_again(run: FinishedRun) -> None:
     changed = {name: (value, default) for name, value, default, _ in changed_settings(run.run.config)}
     assert changed["rva.tau_R"] == ("0.61", "0.7") and changed["rivr.distil.steps"] == ("100", "unset")
     assert command(run.run, run.dag) == (
-        "cleargs run 'gone & <away>.mp4' -o run --workflow smoke --set rva.tau_R=0.61"
+        "cleargs run 'gone & <away>.mp4' -o run --recipe smoke --set rva.tau_R=0.61"
     )
 
 
