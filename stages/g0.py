@@ -64,7 +64,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 25
+VERSION = 26
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -115,6 +115,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
     from cleargs.formation.frames import real_views
+    from cleargs.formation.movement import write_movement
     from cleargs.formation.observed import evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
@@ -166,10 +167,12 @@ def run(context: StageContext[G0Config]) -> StageResult:
     write_exposure(context.out / "exposure.parquet", learned)
     weights = {view.frame_id: view.weight for view in views}
     write_formation(context.out / "formation.parquet", formation, weights)
+    moving = formation.moving
+    write_movement(context.out / "movement.parquet", moving)
     save_state(context.out / "state.safetensors", trained.state)
 
     on_device = trained.scene.to(context.device)
-    fits = evaluate_views(on_device, views, learned, formation.frames)
+    fits = evaluate_views(on_device, views, learned, formation.frames, moving=moving)
     psnr = {view.frame_id: fit.psnr for view, fit in zip(views, fits, strict=True)}
     strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
     return StageResult(
@@ -181,6 +184,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "sh_degree": gaussians.sh_degree,
             "exposure": exposure is not None,
             "exposure_spread": spread,
+            "moving_share": sum(float(cells.mean()) for cells in moving.values()) / len(views),
             "psnr_strong": _mean([psnr[frame_id] for frame_id in strong if frame_id in psnr]),
             "psnr_active": _mean(list(psnr.values())),
             "psnr_unseen": pooled_unseen(fits),

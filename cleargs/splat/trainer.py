@@ -220,6 +220,7 @@ class Trainer:
         camera = view.camera.scaled(factor) if formed is None else formed.camera
         render = self._render(camera, depth=formed is not None and formed.needs_depth)
         image = render.image if formed is None else formed.forward(render)
+        mask = mask if formed is None else formed.mask
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         gradient = self._add_loss(image, target, mask, weight)
         if config.densify and self._schedule.wants_errors(schedule_step):

@@ -216,15 +216,18 @@ def crossed() -> list[TrainingView]:
 
 
 def test_what_moves_teaches_little(tmp_path: Path) -> None:
-    """Every place is covered in one view of five at most; without the weights a fifth of the red stays."""
+    """Every place is covered in one view of five at most; without masks a fifth of the red stays.
+
+    The first looks have no witnesses, so that a little is learned before the masks are there.
+    """
     errors = {}
     for name, tolerance, motions in (("plain", 0.0, True), ("doubted", 0.05, True), ("alone", 0.05, False)):
         look = FormationConfig(start=0.0, unexplained=tolerance, enabled=motions)
         trained = run(tmp_path / name, crossed(), CaptureFormation(crossed(), look))
         shown = [render_observed(trained.scene, view) - render_observed(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
-    assert errors["doubted"] < 0.1 * errors["plain"], errors
-    assert errors["alone"] < 0.1 * errors["plain"], errors
+    assert errors["doubted"] < 0.2 * errors["plain"], errors
+    assert errors["alone"] < 0.2 * errors["plain"], errors
 
 
 def test_a_resumed_training_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
