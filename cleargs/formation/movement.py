@@ -60,7 +60,7 @@ MOVEMENT = pa.schema(
 
 
 class Movement:
-    """What moves in the frames of a capture, found while a scene is trained.
+    """Movement in the frames of a capture, found while a scene is trained.
 
     Args:
         cameras: Cameras of the frames, by frame_id, at full size.

@@ -191,7 +191,7 @@ class TrainedScene:
     ) -> Fidelity | None:
         """Return the agreement of the scene with the held-out frames; None without any.
 
-        What moves does not count: as found in this scene, or in that ``before``, which it is compared with.
+        Movement does not count: as found for this scene, or for that ``before``, which it is compared with.
         Raw frames may be blurred and skewed by the camera's motion, and a sharp scene is not wrong because of
         that. A frame is therefore compared with the render with that frame's motion.
         """

@@ -1,4 +1,4 @@
-"""Share of a frame in which something stands in front of the scene: a person, a hand, a pet.
+"""Share of a frame with something in front of the scene: a person, a hand, a pet.
 
 Frames just before and after a frame agree on sparse points that it should see as well. A part of the frame
 that sees almost none of them, where the rest of the frame sees most, is hidden. A blurred frame loses points

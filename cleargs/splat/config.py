@@ -64,11 +64,11 @@ class FormationConfig(Settings):
     )
     pose: bool = Field(False, description="correct the pose of a frame together with its motion")
     unexplained: float = Field(
-        0.0,
+        0.05,
         ge=0,
         le=1,
-        description="difference of colour (sRGB, mean of a neighbourhood, e.g. 0.05) above which unexplained "
-        "pixels count less, for captures with moving people or objects; 0 = off",
+        description="difference of colour (sRGB, mean of a neighbourhood) above which a region that the "
+        "scene of the other frames does not explain is treated as movement and does not count; 0 = off",
     )
 
     accept: ClassVar[float] = 0.02

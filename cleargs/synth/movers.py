@@ -90,7 +90,7 @@ class Household:
         room: The room without them.
         duration: Duration of the capture, seconds.
         seed: Seed of sizes, textures and flicker.
-        severity: How much moves.
+        severity: Amount of movement.
     """
 
     def __init__(self, room: Room, duration: float, seed: int, severity: Severity) -> None:
