@@ -128,11 +128,20 @@ class Movement:
             found = np.abs(self._pooled(difference) / shares[..., None]).mean(axis=2)
             depth = self._pooled(render.depth[inner].cpu().numpy()) / alpha
         self._differences[k] = np.where(known, found, np.inf)
-        others, seen = self._elsewhere(k, np.where(known, depth, 1.0))
-        ordinary = max(self._tolerance, MEDIAN_FACTOR * float(np.median(found[known]))) if known.any() else 1
-        unexplained = known & (found > ordinary) & (others < OTHERS_FACTOR * found)
-        before = self._moves[k] & (seen < MIN_OTHERS)  # without witnesses it stays as it was
-        self._moves[k] = regions(unexplained & (seen >= MIN_OTHERS)) | before
+        ordinary = (
+            max(self._tolerance, MEDIAN_FACTOR * float(np.median(found[known]))) if known.any() else 1.0
+        )
+        asked = (known & (found > ordinary)) | self._moves[k]
+        if not asked.any():
+            return
+        rows, columns = np.nonzero(asked)
+        others, witnesses = self._elsewhere(k, rows, columns, np.where(known, depth, 1.0)[asked])
+        mine = self._differences[k, rows, columns]
+        moves, unwitnessed = np.zeros_like(asked), np.zeros_like(asked)
+        moves[asked] = (mine > ordinary) & (others < OTHERS_FACTOR * mine) & (witnesses >= MIN_OTHERS)
+        moves &= known
+        unwitnessed[asked] = witnesses < MIN_OTHERS
+        self._moves[k] = regions(moves) | (self._moves[k] & unwitnessed)  # these stay as they were
 
     def still(self, frame_id: int, mask: Tensor | None, target: Tensor) -> Tensor | None:
         """Return the pixels of a frame that count: see `counted`."""
@@ -156,36 +165,39 @@ class Movement:
         rows, columns = self._moves.shape[1:]
         return np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA))
 
-    def _elsewhere(self, k: int, depth: ArrayF32) -> tuple[ArrayF32, NDArray[np.int64]]:
-        """Return the median difference of the other frames at the places that the cells of a frame show.
+    def _elsewhere(
+        self, k: int, row: NDArray[np.intp], column: NDArray[np.intp], depth: ArrayF32
+    ) -> tuple[ArrayF32, NDArray[np.int64]]:
+        """Return the median difference of the other frames at the places that cells of a frame show.
 
         Args:
             k: Index of the frame.
-            depth: [rows, columns] of its cells, camera z.
+            row: Rows of the cells [C].
+            column: Columns of the cells [C].
+            depth: Camera z of the places [C].
 
         Returns:
-            The median, infinite where no other frame sees the place, and the number of frames that see it and
-            have been looked at, both [rows, columns].
+            The median [C], infinite where no other frame sees the place, and the number of frames [C] that
+            see it and have been looked at.
         """
-        rows, columns = depth.shape
+        rows, columns = self._moves.shape[1:]
         fx, fy, cx, cy = self._lenses[k]
-        x = ((np.arange(columns) + 0.5) / columns - cx) / fx * depth
-        y = ((np.arange(rows)[:, None] + 0.5) / rows - cy) / fy * depth
+        x, y = ((column + 0.5) / columns - cx) / fx * depth, ((row + 0.5) / rows - cy) / fy * depth
         points = np.stack([x, y, depth, np.ones_like(depth)], axis=-1)
         between = np.einsum("fij,jk->fik", self._to_camera, np.linalg.inv(self._to_camera[k]))
-        local = np.einsum("fij,yxj->fyxi", between, points)  # [F, rows, columns, 4]
-        z = np.maximum(local[..., 2], 1e-6)
-        fx, fy, cx, cy = (numbers[:, None, None] for numbers in self._lenses.T)
-        column = np.floor((local[..., 0] / z * fx + cx) * columns)
-        row = np.floor((local[..., 1] / z * fy + cy) * rows)
-        inside = (local[..., 2] > 1e-3) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        x, y, z, _ = np.moveaxis(np.einsum("fij,cj->fci", between, points), 2, 0)  # [F, C] each
+        ahead = np.maximum(z, 1e-6)
+        fx, fy, cx, cy = (numbers[:, None] for numbers in self._lenses.T)
+        column_there = np.floor((x / ahead * fx + cx) * columns)
+        row_there = np.floor((y / ahead * fy + cy) * rows)
+        inside = (z > 1e-3) & (column_there >= 0) & (column_there < columns)
+        inside &= (row_there >= 0) & (row_there < rows)
         inside[k] = False
-        frames = np.arange(len(inside))[:, None, None]
-        at = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
-        there = np.where(inside, self._differences[frames, *at], np.inf)
-        seen = np.isfinite(there).sum(axis=0)
-        middle = np.maximum(seen - 1, 0)[None] // 2
-        return np.take_along_axis(np.sort(there, axis=0), middle, axis=0)[0], seen
+        at = (np.where(inside, place, 0).astype(np.intp) for place in (row_there, column_there))
+        there = np.where(inside, self._differences[np.arange(len(inside))[:, None], *at], np.inf)
+        witnesses = np.isfinite(there).sum(axis=0)
+        middle = np.maximum(witnesses - 1, 0)[None] // 2
+        return np.take_along_axis(np.sort(there, axis=0), middle, axis=0)[0], witnesses
 
 
 def regions(cells: MaskBool) -> MaskBool:  # [rows, columns]
