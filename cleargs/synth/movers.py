@@ -24,8 +24,6 @@ WALK_RADIUS, WALK_ANGLE = 1.1, np.radians(75)
 and the angle at either end."""
 HIDDEN = -1000.0
 """Height of a person outside the room, metres, so far away that ambient light does not notice."""
-PUT_ELSEWHERE = 0.6
-"""Share of the walk after which the thing is at its second place."""
 FLICKERS_PER_SECOND, FLICKER_STOPS = 12.0, 1.5
 """Changes of the screen's brightness, and the largest change in stops."""
 
@@ -70,6 +68,8 @@ class Severity:
 
     walks: tuple[tuple[float, float], ...]
     """Begin and end of each crossing by the person, shares of the capture; every second one goes back."""
+    elsewhere: tuple[float, float]
+    """Begin and end of the time in which the thing is at its second place, shares of the capture."""
     flicker: tuple[float, float]
     """Begin and end of the screen's flicker, shares of the capture."""
     thing: float
@@ -77,14 +77,14 @@ class Severity:
 
 
 SEVERITIES = {
-    1: Severity(walks=((0.3, 0.7),), flicker=(0.1, 0.4), thing=0.14),
-    2: Severity(walks=((0.0, 0.48), (0.52, 1.0)), flicker=(0.1, 0.6), thing=0.24),
+    1: Severity(walks=((0.3, 0.7),), elsewhere=(0.5, 0.75), flicker=(0.1, 0.4), thing=0.14),
+    2: Severity(walks=((0.0, 0.48), (0.52, 1.0)), elsewhere=(0.4, 0.8), flicker=(0.1, 0.6), thing=0.24),
 }
 """By the number of a protocol. The person is in view in about a third, or in two thirds, of the frames."""
 
 
 class Household:
-    """A person who walks through, a thing on the table that is put elsewhere, and a screen that flickers.
+    """A person who walks through, a thing that is put elsewhere and back, and a screen that flickers.
 
     Args:
         room: The room without them.
@@ -128,7 +128,8 @@ class Household:
         shares = times / self._duration
         states = np.ones((*times.shape, len(self.items), 4))
         states[..., :3] = self.items["centre"]
-        states[shares > PUT_ELSEWHERE, 0, :3] = self._second
+        begin, end = self._severity.elsewhere
+        states[(shares > begin) & (shares < end), 0, :3] = self._second
         begin, end = self._severity.flicker
         stops = self._stops[np.floor(times * FLICKERS_PER_SECOND).astype(np.intp) % len(self._stops)]
         states[..., 1, 3] = np.where((shares > begin) & (shares < end), 2.0**stops, 1.0)
