@@ -30,7 +30,7 @@ from torch import Tensor
 from cleargs.parquet import column, read_table, write_table
 from cleargs.splat.camera import Camera
 from cleargs.splat.types import Render
-from cleargs.types import ArrayF32, MaskBool
+from cleargs.types import ArrayF32, ArrayF64, MaskBool
 
 CELLS = 32
 """Cells along the longer side of a frame."""
@@ -40,11 +40,15 @@ OTHERS_FACTOR = 0.5
 """Part of a cell's difference up to which the median of the other frames, at the same place, contradicts."""
 MIN_OTHERS = 3
 """Fewest other frames that see a place where something can move."""
+NEAR_FRAMES, MAX_NEAR_SHARE = 8, 0.5
+"""Number of the other frames with the nearest cameras, and the largest share of them in which the same place
+may move. Where it moves in more of them, something that does not move has been left out by mistake: the masks
+keep it from being learned, and then it differs."""
 MIN_CELLS = 6
 """Fewest cells of a region that moves."""
 EVERY = 3
 """Steps on a frame between two looks at what moves in it."""
-START = 0.05
+START = 0.25
 """Share of the schedule from which movement is looked for."""
 
 MOVEMENT = pa.schema(
@@ -86,6 +90,7 @@ class Movement:
             if frame_id in self._place and cells.shape == shape:
                 self._moves[self._place[frame_id]] = cells
         self._to_camera = np.array([camera.world_to_camera for camera in self._cameras]).reshape(-1, 4, 4)
+        self._centres = np.array([camera.centre for camera in self._cameras]).reshape(-1, 3)
         self._lenses = np.array(
             [(c.fx / c.width, c.fy / c.height, c.cx / c.width, c.cy / c.height) for c in self._cameras]
         ).reshape(-1, 4)
@@ -135,10 +140,11 @@ class Movement:
         if not asked.any():
             return
         rows, columns = np.nonzero(asked)
-        others, witnesses = self._elsewhere(k, rows, columns, np.where(known, depth, 1.0)[asked])
+        others, witnesses, near = self._elsewhere(k, rows, columns, np.where(known, depth, 1.0)[asked])
         mine = self._differences[k, rows, columns]
         moves, unwitnessed = np.zeros_like(asked), np.zeros_like(asked)
         moves[asked] = (mine > ordinary) & (others < OTHERS_FACTOR * mine) & (witnesses >= MIN_OTHERS)
+        moves[asked] &= near <= MAX_NEAR_SHARE
         moves &= known
         unwitnessed[asked] = witnesses < MIN_OTHERS
         self._moves[k] = regions(moves) | (self._moves[k] & unwitnessed)  # these stay as they were
@@ -167,8 +173,8 @@ class Movement:
 
     def _elsewhere(
         self, k: int, row: NDArray[np.intp], column: NDArray[np.intp], depth: ArrayF32
-    ) -> tuple[ArrayF32, NDArray[np.int64]]:
-        """Return the median difference of the other frames at the places that cells of a frame show.
+    ) -> tuple[ArrayF32, NDArray[np.int64], ArrayF64]:
+        """Return what the other frames say of the places that cells of a frame show.
 
         Args:
             k: Index of the frame.
@@ -177,8 +183,9 @@ class Movement:
             depth: Camera z of the places [C].
 
         Returns:
-            The median [C], infinite where no other frame sees the place, and the number of frames [C] that
-            see it and have been looked at.
+            The median [C] of their differences, infinite where no other frame sees the place; the number of
+            frames [C] that see it and have been looked at; and the share [C] of the `NEAR_FRAMES` of these
+            with the nearest cameras, in which it moves.
         """
         rows, columns = self._moves.shape[1:]
         fx, fy, cx, cy = self._lenses[k]
@@ -193,11 +200,18 @@ class Movement:
         inside = (z > 1e-3) & (column_there >= 0) & (column_there < columns)
         inside &= (row_there >= 0) & (row_there < rows)
         inside[k] = False
-        at = (np.where(inside, place, 0).astype(np.intp) for place in (row_there, column_there))
-        there = np.where(inside, self._differences[np.arange(len(inside))[:, None], *at], np.inf)
-        witnesses = np.isfinite(there).sum(axis=0)
+        cells = (
+            np.arange(len(inside))[:, None],
+            *(np.where(inside, place, 0).astype(np.intp) for place in (row_there, column_there)),
+        )
+        there = np.where(inside, self._differences[cells], np.inf)
+        seen = np.isfinite(there)
+        witnesses = seen.sum(axis=0)
         middle = np.maximum(witnesses - 1, 0)[None] // 2
-        return np.take_along_axis(np.sort(there, axis=0), middle, axis=0)[0], witnesses
+        order = np.argsort(np.square(self._centres - self._centres[k]).sum(axis=1), kind="stable")
+        near = seen[order] & (np.cumsum(seen[order], axis=0) <= NEAR_FRAMES)
+        share = (self._moves[cells][order] & near).sum(axis=0) / np.maximum(near.sum(axis=0), 1)
+        return np.take_along_axis(np.sort(there, axis=0), middle, axis=0)[0], witnesses, share
 
 
 def regions(cells: MaskBool) -> MaskBool:  # [rows, columns]
