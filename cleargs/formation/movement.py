@@ -36,7 +36,7 @@ CELLS = 32
 """Cells along the longer side of a frame."""
 MEDIAN_FACTOR = 5.0
 """Multiple of the frame's median difference up to which a difference is ordinary."""
-OTHERS_FACTOR = 0.5
+OTHERS_FACTOR = 0.2
 """Part of a cell's difference up to which the median of the other frames, at the same place, contradicts."""
 MIN_OTHERS = 3
 """Fewest other frames that see a place where something can move."""

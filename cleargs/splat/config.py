@@ -64,7 +64,7 @@ class FormationConfig(Settings):
     )
     pose: bool = Field(False, description="correct the pose of a frame together with its motion")
     unexplained: float = Field(
-        0.05,
+        0.1,
         ge=0,
         le=1,
         description="difference of colour (sRGB, mean of a neighbourhood) above which a region that the "
