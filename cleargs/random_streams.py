@@ -31,3 +31,4 @@ class Stream(IntEnum):
     SHAKY_STRETCHES = 19
     BALLOON = 20
     PHONE_LOOK = 21
+    HOUSEHOLD = 30

@@ -154,7 +154,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     verdict = judge_harm(
         supervision.holdout_ids,
         g0.fidelity(supervision.holdout_views, scorer, threads),
-        consolidated.fidelity(supervision.holdout_views, scorer, threads),
+        consolidated.fidelity(supervision.holdout_views, scorer, threads, g0),
         harm,
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)

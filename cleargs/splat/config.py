@@ -68,11 +68,11 @@ class FormationConfig(Settings):
         "adjusted the poses, that is, unless those of the input fit within ingest.refine_above",
     )
     unexplained: float = Field(
-        0.0,
+        0.1,
         ge=0,
         le=1,
-        description="difference of colour (sRGB, mean of a neighbourhood, e.g. 0.05) above which unexplained "
-        "pixels count less, for captures with moving people or objects; 0 = off",
+        description="difference of colour (sRGB, mean of a neighbourhood) above which a region that the "
+        "scene of the other frames does not explain is treated as movement and does not count; 0 = off",
     )
 
     @field_validator("pose", mode="before")

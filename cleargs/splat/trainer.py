@@ -221,6 +221,7 @@ class Trainer:
         colour = random_colour(self._seed, schedule_step) if config.background is None else None
         render = self._render(camera, depth=depth, background=colour)
         image = render.image if formed is None else formed.forward(render)
+        mask = mask if formed is None else formed.mask
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         gradient = self._add_loss(image, target, mask, weight)
         if config.densify and self._schedule.wants_errors(schedule_step):

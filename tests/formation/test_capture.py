@@ -23,6 +23,7 @@ from cleargs.formation.comparison import FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
+from cleargs.formation.movement import still_pixels
 from cleargs.formation.observed import render_observed
 from cleargs.formation.search import search
 from cleargs.formation.table import read_formation, write_formation
@@ -289,15 +290,42 @@ def crossed() -> list[TrainingView]:
 
 
 def test_what_moves_teaches_little(tmp_path: Path) -> None:
-    """Every place is covered in one view of five at most; without the weights a fifth of the red stays."""
+    """Every place is covered in one view of five at most; without masks a fifth of the red stays.
+
+    The first looks have no witnesses, so that a little is learned before the masks are there.
+    """
     errors = {}
     for name, tolerance, motions in (("plain", 0.0, True), ("doubted", 0.05, True), ("alone", 0.05, False)):
         look = FormationConfig(start=0.0, unexplained=tolerance, enabled=motions)
         trained = run(tmp_path / name, crossed(), CaptureFormation(crossed(), look))
         shown = [render_observed(trained.scene, view) - render_observed(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
-    assert errors["doubted"] < 0.1 * errors["plain"], errors
-    assert errors["alone"] < 0.1 * errors["plain"], errors
+    assert errors["doubted"] < 0.2 * errors["plain"], errors
+    assert errors["alone"] < 0.2 * errors["plain"], errors
+
+
+def test_a_repair_does_not_teach_where_its_frame_moves() -> None:
+    cells = np.zeros((21, 32), np.bool_)
+    cells[5:9, 10:15] = True
+    formation = CaptureFormation(views(), FormationConfig(start=1.0), moving={1: cells})
+    target, mask = torch.zeros(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, :5] = False
+    for kind in ("real", "pseudo"):
+        view = replace(views()[1], kind=kind)
+        formed = formation.form(view, 1.0, 0.0, target, mask, lambda camera: pytest.fail("no look is due"))
+        assert formed is not None and formed.mask is not None
+        expected = mask & torch.from_numpy(still_pixels(cells, HEIGHT, WIDTH))
+        assert torch.equal(formed.mask, expected) and not bool(expected.all())
+    other = formation.form(views()[2], 1.0, 0.0, target, mask, lambda camera: pytest.fail("no look is due"))
+    assert other is None
+
+
+def test_where_nothing_moves_a_training_has_the_bits_of_one_without_looks(tmp_path: Path) -> None:
+    seen, scenes = views(blurred=None), []
+    for name, tolerance in (("off", 0.0), ("on", 0.05)):
+        formation = CaptureFormation(seen, FormationConfig(enabled=False, unexplained=tolerance))
+        scenes.append(run(tmp_path / name, seen, formation).scene.gaussians.tensors())
+    assert all(torch.equal(tensor, scenes[1][name]) for name, tensor in scenes[0].items())
 
 
 @pytest.mark.parametrize("motion", [BLUR, BENT], ids=["straight", "curved"])
