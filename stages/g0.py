@@ -76,7 +76,7 @@ LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
 
-def other_libraries(device: Device) -> Mapping[str, str]:
+def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     """Return further libraries that compute on ``device``."""
     return {"triton": installed_version("triton")} if device == "cuda" else {}
 
