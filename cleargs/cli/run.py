@@ -37,7 +37,6 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import LOG, make_reporter
 from cleargs.cli.report import outdated_report_note, write_run_report
-from cleargs.files import write_bytes
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
@@ -52,13 +51,11 @@ from cleargs.pipeline.session import (
 )
 from cleargs.pipeline.settings import flattened
 from cleargs.report.formatting import duration
+from cleargs.report.report_json import ENTRY
 from cleargs.safe_io import printable
 
 Summaries = Mapping[str, Mapping[str, Any]]
 """Stage -> figures in its manifest."""
-
-REPORT_LINK = "report.html"
-"""Page in the run folder that opens the report."""
 
 
 @click.command(
@@ -198,7 +195,7 @@ def run(
             made = outcome.manifest
             cost = f"{made.seconds:.1f} s, {made.peak_memory_gb or 0:.2f} GB memory"
             log(f"{outcome.stage}: {outcome.how}, {cost}, key {made.key}")
-        lines = outcome_lines(outcomes, folder, page and _report_link(settings.folder, page))
+        lines = outcome_lines(outcomes, folder, page and settings.folder / ENTRY)
         for line in lines:
             context.meta[LOG](line)
     if as_json:
@@ -235,17 +232,6 @@ def without_effect(config: Config, given: Sequence[str]) -> Iterator[str]:
             f"{', '.join(fixed)} stay as they are, whatever the quality; "
             "--recipe default --reset gives them up"
         )
-
-
-def _report_link(run: Path, page: Path) -> Path:
-    """Write the page ``RUN/report.html``, which opens the report ``page``. Return its path."""
-    link, target = run / REPORT_LINK, page.relative_to(run).as_posix()
-    text = (
-        f'<!DOCTYPE html><meta charset="utf-8"><title>Report</title>'
-        f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">Open the report</a>\n'
-    )
-    write_bytes(link, text.encode())
-    return link
 
 
 _RUN = run  # the command, whose name is an argument below

@@ -35,9 +35,7 @@ if TYPE_CHECKING:
 
 MAX_LISTED = 16  # items of a list that are printed
 MAX_NAME_LENGTH = 14  # characters of a frame's name in a table
-MIN_FAULT = 0.2  # smaller distances of a cue from its best value are not reported
 LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; width in px
-PLOT = "rva-plot.png"  # default file of --plot in the run folder
 HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
 
 LABELS: Mapping[str, str] = {
@@ -66,15 +64,6 @@ LABELS: Mapping[str, str] = {
 OVERVIEW = ("frames", "registered", "test", "points", "roles", "gaussians", "psnr_unseen", "repairs")
 """Figures in the overview of a run, which also names the ``published`` scene."""
 
-MODELS = {
-    "none": "nothing found",
-    "blur": "motion blur",
-    "skew": "rolling shutter",
-    "both": "motion blur and rolling shutter",
-    "defocus": "defocus",
-}
-"""Model of a frame's image formation -> its name."""
-
 
 @click.command(
     epilog="""\b
@@ -82,18 +71,12 @@ Examples:
   cleargs show room                 all stages: state, time, size, figures
   cleargs show room rva             role and weight of each frame, and why
   cleargs show room rva --columns   the columns of the tables, with their meanings
-  cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
   cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
 )
 @run_argument
 @click.argument("stage", required=False, shell_complete=completed(stage_names))
 @click.option("--columns", is_flag=True, help="List the columns of the tables, with their meanings.")
-@click.option(
-    "--plot",
-    is_flag=True,
-    help="For rva: draw trajectory, scores, roles, weights, and the best and worst frames.",
-)
 @click.option(
     "--frame",
     type=click.IntRange(min=0),
@@ -104,7 +87,7 @@ Examples:
     "-o",
     "--output",
     type=FILE,
-    help=f"File of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
+    help="File of --frame (.png).  [default: RUN/frame-N.png]",
 )
 @json_option
 @click.pass_obj
@@ -113,18 +96,16 @@ def show(
     run: Path,
     stage: str | None,
     columns: bool,
-    plot: bool,
     frame: int | None,
     output: Path | None,
     as_json: bool,
 ) -> None:
     """Show the results of the stages of RUN, or the tables of one STAGE."""
-    draws = output is not None and output.suffix.lower() == ".png" and (plot or frame is not None)
+    draws = output is not None and output.suffix.lower() == ".png" and frame is not None
     for cause, wrong, example in (
-        ("--plot needs the stage rva", plot and stage != "rva", "rva --plot"),
         ("--frame cannot be used with a stage", frame is not None and stage is not None, f"--frame {frame}"),
         ("--columns needs the name of a stage", stage is None and columns, "rva --columns"),
-        ("--output needs --plot or --frame, and a .png file", output and not draws, "rva --plot -o FILE.png"),
+        ("--output needs --frame, and a .png file", output and not draws, "--frame 3 -o FILE.png"),
     ):
         if wrong:
             raise InputError(cause, hint=f"cleargs show {run} {example}")
@@ -139,12 +120,6 @@ def show(
             _print_run(settings, {name: done.get(name) for name in dag.names})
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
-    elif plot:
-        from cleargs.report.allocation_picture import plot_allocation
-
-        picture = output or run / PLOT
-        plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
-        answer(as_json, {"stage": stage, "plot": str(picture)}, f"written: {picture}")
     else:
         _show_stage(run, done, stage, columns, as_json)
 
@@ -264,6 +239,8 @@ def frame_rows(
         settings: The settings of RVA that made these rows.
         repairs: The rows of ``rivr/selection.parquet``; None before RIVR, when frames have no "repair".
     """
+    from cleargs.report.frames import worst_cue
+
     latest = {row["frame_id"]: row for row in sorted(repairs or (), key=lambda row: int(row["round"]))}
     found = []
     for row in rows:
@@ -279,16 +256,6 @@ def short_name(name: str) -> str:
     """Return the end of a frame's name, which differs most between frames."""
     last = name.rpartition("/")[2]
     return last if len(last) <= MAX_NAME_LENGTH else f"…{last[1 - MAX_NAME_LENGTH :]}"
-
-
-def worst_cue(row: Mapping[str, Any]) -> str:
-    """Return the cue farthest from its best value, as "motion blur 0.82"; "" if all are good."""
-    off = {name: 1.0 - value for name, value in row.items() if name.startswith("r_") and value is not None}
-    off |= {name: value for name, value in row.items() if name.startswith("b_") and value is not None}
-    worst = max(off, key=lambda name: off[name], default="")
-    if not worst or off[worst] < MIN_FAULT:
-        return ""
-    return f"{worst[2:].replace('_', ' ')} {row[worst]:.2f}"
 
 
 def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
@@ -337,7 +304,7 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
 
     Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
-    from cleargs.report.frames import MEANINGS, camera_of, load_rows
+    from cleargs.report.frames import MEANINGS, camera_of, load_rows, worst_cue
     from cleargs.rivr.tables import REPAIRS
 
     if "ingest" not in done:
@@ -401,7 +368,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
 def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield label and text of each line about a frame. ``--json`` has more."""
-    from cleargs.report.frames import CHOICES, scores_of
+    from cleargs.report.frames import CHOICES, EFFECTS, scores_of
 
     frame, judged = row.frame, facts["rva"]
     yield "file", frame.name
@@ -420,10 +387,10 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
         yield "scores", ", ".join(f"{name} {value:.2f}" for name, value in known)
         yield "worst cue", judged["worst_cue"] or "none"
     if found := row.formation:
-        model = MODELS.get(found["model"], found["model"])
         if found["model"] == "none":
-            yield "formation", model
+            yield "formation", "nothing found"
         else:
+            model = EFFECTS[found["model"]][0]
             lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
             sizes = ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
             yield "formation", f"{model}, explains {100 * found['explained']:.0f} % of the misfit; {sizes}"

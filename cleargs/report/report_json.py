@@ -13,6 +13,8 @@ from cleargs.manifest import Manifest, linked_manifest
 from cleargs.safe_io import read_json
 
 FOLDER, PAGE, REPORT_JSON = "report", "index.html", "report.json"
+ENTRY = "report.html"
+"""File in the run folder that leads to the report."""
 
 
 @dataclass(frozen=True)
