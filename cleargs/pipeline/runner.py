@@ -66,16 +66,10 @@ class Runner:
     def run_until(
         self, until: str | None = None, *, force: Sequence[str] = (), allow_partial: bool = False
     ) -> list[StageOutcome]:
-        """Find or make the results of each stage, and link them into the run folder.
+        """Find or make the results of each stage up to ``until``, and link them into the run folder.
 
-        Args:
-            until: The last stage; None for all stages.
-            force: Stages to run even if their results are in the store.
-            allow_partial: Continue after a stage that is done only in part. Otherwise, the run stops there
-                and the last outcome lists what is missing.
-
-        Returns:
-            The outcome of each stage that was found or made, in order.
+        Stages in ``force`` run even if their results are in the store. The run stops after a stage that is
+        done only in part, unless ``allow_partial``; the last outcome lists what is missing.
 
         Raises:
             InputError: A model that a stage needs is missing. Nothing was started.
