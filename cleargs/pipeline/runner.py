@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -30,6 +30,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import exclusive_lock
 from cleargs.pipeline.plan import (
+    NO_RESULTS,
     Planner,
     StageKey,
     StagePlan,
@@ -88,7 +89,8 @@ class Runner:
                 self.reporter.info(line)
         outcomes: list[StageOutcome] = []
         done: dict[str, Manifest] = {}
-        with self._lock_run(), self.store.in_use():
+        lock = exclusive_lock(self.run.folder / LOCK, self.reporter, self.run.folder.name)
+        with lock, self.store.in_use():
             check_same_input(self.run, self.dag, self.store)
             self._unlink_outdated()  # before run.toml changes: no results of other settings
             write_run_file(self.run)
@@ -104,10 +106,6 @@ class Runner:
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
         return outcomes
-
-    def _lock_run(self) -> AbstractContextManager[bool]:
-        """Hold the lock of the run folder; wait for another process that works in it."""
-        return exclusive_lock(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
     def _unlink_outdated(self) -> None:
         """Remove the links to results of other settings or inputs."""
@@ -190,7 +188,8 @@ class Runner:
                 entry = self._find(name, stage_key)
                 manifest = entry.complete if entry is not None and not forced else None
                 if manifest is None:  # otherwise another process made it in the meantime
-                    self.reporter.info(f"{name}: started ({'; '.join(reasons)})")
+                    because = "" if reasons == (NO_RESULTS,) else f" ({'; '.join(reasons)})"
+                    self.reporter.info(f"{name}: started{because}")
                     manifest, how = self._make(stage_key, entry, forced=forced, locked=locked), "made"
         manifest = self._with_inherited(manifest, stage_key.inherited)
         self.store.link(self.run.folder, name, stage_key.key)

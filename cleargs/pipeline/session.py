@@ -42,8 +42,8 @@ def resolve_device(
     """Return the device to use. Does not import torch, which would take seconds.
 
     ``auto`` keeps the device of an existing run (``kept``). Otherwise it uses a GPU that passed its self-test
-    and is faster than the CPU, tells ``say`` the reason, and with ``test`` runs a self-test that was not made
-    yet. Raises InputError if the chosen or kept device is a GPU that cannot be used.
+    and is faster than the CPU, and reports the reason to ``say``. With ``test``, it runs the self-test of a
+    GPU that was not tested yet. Raises InputError if the chosen or kept device is a GPU that cannot be used.
     """
     if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"

@@ -187,8 +187,8 @@ class Store:
         """Prepare the work folder of ``key``.
 
         A ``forced`` rebuild has a separate folder, and resumes only from a forced attempt. Otherwise, usable
-        results in ``entry`` are copied to the outputs, unless there are outputs already. Of a killed attempt,
-        only the files that match ``leftovers`` stay. Without the lock of the key, this process works in its
+        results in ``entry`` are copied to the outputs, unless there are outputs already. Files of a killed
+        attempt stay only if they match ``leftovers``. Without the lock of the key, this process works in its
         own folder, which takes over the common one if there is one.
         """
         work = WorkFolder(self.root / "work" / (f"{key}.forced" if forced else key))

@@ -270,7 +270,7 @@ IMAGE_BYTES = 8_500_000
 _BYTES_PER_PIXEL = 0.18  # in JPEG files at _QUALITY
 _SIDE_MAX, _SIDE_MIN = 960, 240  # limits of the long side of a layer, px
 _THUMBNAIL, _QUALITY = 240, 84  # long side, px; JPEG quality
-_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # of a drawn path and its border
+_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # border and colour of a drawn path
 _UNUSED = (214, 69, 48)  # colour of pixels that no training used, sRGB
 
 MAX_RENDERED = 40
@@ -424,7 +424,7 @@ def with_paths(image: ImageU8, row: FrameRow) -> ImageU8:
 
 
 def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:
-    """Write ``image`` [H, W, 3] sRGB to the JPEG file ``name`` in the report, at most ``side`` px wide or high."""
+    """Write ``image`` [H, W, 3] sRGB to a JPEG file of the report, at most ``side`` px wide or high."""
     height, width = image.shape[:2]
     factor = min(1.0, side / max(height, width))
     if factor < 1.0:
