@@ -133,16 +133,6 @@ class Runner:
         if line := cost_line(costs):
             self.reporter.info(f"new {line}")
 
-    def _find(self, name: str, stage_key: StageKey) -> Entry | None:
-        """Return the results for ``stage_key``. Damaged ones cause a warning and count as missing."""
-        entry = self.store.find(name, stage_key.key)
-        if entry is not None and entry.damage is not None:
-            self.reporter.warn(
-                f"{name}: the stored results are damaged ({entry.damage}); the stage runs again"
-            )
-            return None
-        return entry
-
     def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and link them into the run folder.
 
@@ -185,7 +175,12 @@ class Runner:
             entry = self.store.find(name, stage_key.key)
             reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
             with self.store.lock(stage_key.key, self.reporter, name) as locked:
-                entry = self._find(name, stage_key)
+                entry = self.store.find(name, stage_key.key)
+                if entry is not None and entry.damage is not None:
+                    self.reporter.warn(
+                        f"{name}: the stored results are damaged ({entry.damage}); the stage runs again"
+                    )
+                    entry = None
                 manifest = entry.complete if entry is not None and not forced else None
                 if manifest is None:  # otherwise another process made it in the meantime
                     because = "" if reasons == (NO_RESULTS,) else f" ({'; '.join(reasons)})"

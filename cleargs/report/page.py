@@ -162,18 +162,9 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             },
         )
         write_report_json(folder, manifests, last)
-    write_entry_page(run)
+    leads_to_it = page_environment().get_template("entry.html.jinja").render(name=run.name)
+    write_bytes(run / ENTRY, leads_to_it.encode())
     return page_of(run)
-
-
-def write_entry_page(run: Path) -> Path:
-    """Write ``RUN/report.html``, a small page that leads to the report, and return its path.
-
-    Raises StoreError if it cannot be written.
-    """
-    page = page_environment().get_template("entry.html.jinja").render(name=run.name)
-    write_bytes(run / ENTRY, page.encode())
-    return run / ENTRY
 
 
 def _write_scene(
