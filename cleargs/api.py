@@ -136,7 +136,7 @@ def initialise(
     from cleargs import G0Config
     from cleargs.capture.tables import load_observations
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
-    from cleargs.splat.scene import Scene
+    from cleargs.splat.scene import BLACK, Scene
 
     views = capture.views() if views is None else views
     config = resolve_config(config or G0Config(), views)
@@ -151,7 +151,7 @@ def initialise(
         sh_degree=config.sh_degree,
         seed=seed,
     )
-    return Scene(gaussians, config.antialias, config.background)
+    return Scene(gaussians, config.antialias, config.background or BLACK)
 
 
 def train(

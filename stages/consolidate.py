@@ -42,7 +42,7 @@ class ConsolidateConfig(Settings):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 26
+VERSION = 28
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -154,7 +154,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     verdict = judge_harm(
         supervision.holdout_ids,
         g0.fidelity(supervision.holdout_views, scorer, threads),
-        consolidated.fidelity(supervision.holdout_views, scorer, threads),
+        consolidated.fidelity(supervision.holdout_views, scorer, threads, g0),
         harm,
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)

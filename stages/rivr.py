@@ -121,7 +121,7 @@ class RivrConfig(Settings):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 29
+VERSION = 31
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -255,7 +255,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         )
 
     before = g0.fidelity(supervision.holdout_views, rules.primary, threads)
-    after = current.fidelity(supervision.holdout_views, rules.primary, threads)
+    after = current.fidelity(supervision.holdout_views, rules.primary, threads, g0)
     verdict = judge_harm(supervision.holdout_ids, before, after, config.harm)
     if verdict.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")

@@ -14,11 +14,11 @@ class RvaConfig(AssessmentConfig, EvaluatorConfig):
     """Reliability-aware View Allocation. The defaults are those of the paper, except `active_share`."""
 
 
-VERSION = 4
+VERSION = 5
 CONFIG = RvaConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
-    "ingest": ("frames.parquet", "observations.parquet", "images", "masks")
+    "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks")
 }
 OUTPUTS = ("frames.parquet", "bins.parquet")
 LEFTOVERS: tuple[str, ...] = ()
@@ -77,11 +77,12 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     """
     import numpy as np
 
-    from cleargs.capture.tables import load_frames, load_observations
+    from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.parquet import write_table
     from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from, summary
     from cleargs.rva.evaluator import EvaluatedFrame, label
     from cleargs.rva.evaluators import make_evaluator
+    from cleargs.rva.hidden import with_hidden_parts
     from cleargs.rva.tables import BINS, FRAMES
 
     config, ingest = context.config, context.inputs["ingest"]
@@ -94,6 +95,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)
+    cues = with_hidden_parts(cues, frames, load_points(ingest), observations)
     frame_id = np.array([frame.frame_id for frame in frames], dtype=np.int32)
     result = assess(frame_id, cues, poses_from(frames), observations, config)
 

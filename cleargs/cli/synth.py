@@ -13,7 +13,7 @@ from cleargs.cli.progress_bars import make_reporter
 
 PROTOCOL_HELP = (
     "Degradations: sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, tremor, gsotm-mb, "
-    "gsotm-rs, gsotm-mb-rs, gsotm-pn, camera or phone."
+    "gsotm-rs, gsotm-mb-rs, gsotm-pn, camera, phone, moving or moving-severe."
 )
 
 
@@ -41,6 +41,7 @@ Protocols, with mean lengths at a width of 640 px:
   gsotm-mb, gsotm-rs, gsotm-mb-rs        motion blur of 8 px, rolling shutter of 12 px, or both
   gsotm-pn                               sharp frames with inexact poses
   phone                                  degradations of a phone's video
+  moving, moving-severe                  the same, with a person, a thing put elsewhere and a flicker
 """
 )
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))

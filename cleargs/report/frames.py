@@ -17,7 +17,10 @@ from cleargs.capture.tables import Frame, load_frames
 from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.metrics import psnr as psnr_of
 from cleargs.formation.exposure import read_exposure
+from cleargs.formation.frame import from_row
 from cleargs.formation.frames import view_of
+from cleargs.formation.motion import pixel_paths
+from cleargs.formation.movement import read_movement, still_pixels
 from cleargs.formation.table import FORMATION
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_rgb, to_uint8
@@ -210,10 +213,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     moving: dict[int, MaskBool] = {}
     if final := last_scene(stages):
         if (path := run / final / "movement.parquet").is_file():
-            for row in read_any_table(path).to_pylist():
-                shape = row["rows"], row["columns"]
-                bits = np.unpackbits(np.frombuffer(row["moves"], np.uint8), count=shape[0] * shape[1])
-                moving[row["frame_id"]] = bits.reshape(shape) > 0
+            moving = read_movement(path)
         exposure = read_exposure(run / final / "exposure.parquet")
         if exposure.enabled:
             affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
@@ -258,6 +258,7 @@ def camera_of(frame: Frame) -> Camera:
 
 LAYERS = {
     "observed": "As filmed",
+    "paths": "Paths during the exposure",
     "explained": "Render with camera effects",
     "deblurred": "Deblurred",
     "restored": "Restored",
@@ -275,6 +276,7 @@ IMAGE_BYTES = 8_500_000
 _BYTES_PER_PIXEL = 0.18  # in JPEG files at _QUALITY
 _SIDE_MAX, _SIDE_MIN = 960, 240  # limits of the long side of a layer, px
 _THUMBNAIL, _QUALITY = 240, 84  # long side, px; JPEG quality
+_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # of a drawn path and its border
 _UNUSED = (214, 69, 48)  # colour of pixels that no training used, sRGB
 
 MAX_RENDERED = 40
@@ -383,8 +385,8 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.moving is not None:
         height, width = images["observed"].shape[:2]
-        cells = cv2.resize(row.moving.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        tint = np.where(cells[..., None] > 0, _UNUSED, images["observed"]).astype(np.uint8)
+        still = still_pixels(row.moving, height, width)[..., None]
+        tint = np.where(still, images["observed"], _UNUSED).astype(np.uint8)
         images["moving"] = np.asarray(cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0), np.uint8)
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")
@@ -395,8 +397,8 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
 def _expected_layers(row: FrameRow) -> int:
     """Return how many layers a frame has besides the final scene."""
     if row.selection is not None and row.selection.exr is not None:
-        return 5
-    return 3 if row.modelled else 1
+        return 6 if row.modelled else 5
+    return 4 if row.modelled else 1
 
 
 def _write_frame(
@@ -408,6 +410,8 @@ def _write_frame(
     side: int,
 ) -> FramePictures:
     images = {**layers_of(row, run), **formed}
+    if row.modelled:
+        images["paths"] = with_paths(images["observed"], row)
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
@@ -423,6 +427,24 @@ def _aligned_psnr(render: ImageU8, observed: ImageU8) -> float | None:
     reference = np.asarray(cv2.resize(observed, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     image, target = render / 255.0, reference / 255.0
     return psnr_of(to_uint8(apply_affine(image, fit_affine(image, target, None))), reference)
+
+
+def with_paths(image: ImageU8, row: FrameRow) -> ImageU8:
+    """Return an image of a frame with the paths of some of its pixels during the exposure, true to scale."""
+    camera = camera_of(row.frame)
+    motion = from_row({**row.formation, "frame_id": row.frame.frame_id}).motion
+    shape = (3, 4) if camera.width >= camera.height else (4, 3)
+    paths = pixel_paths(motion, camera, shape, np.linspace(-0.5, 0.5, 33))
+    rows, columns = np.indices(shape) + 0.5
+    centres = np.stack([columns / shape[1] * camera.width, rows / shape[0] * camera.height], -1)
+    lines = (paths + centres).reshape(len(paths), -1, 2).swapaxes(0, 1)
+    drawn, unit = image.copy(), max(1, round(max(camera.width, camera.height) / 480))
+    fixed = [np.rint(8 * line).astype(np.int32) for line in lines]  # in eighths of a pixel
+    for colour, width in ((_DARK, 3 * unit), (_LIGHT, unit)):
+        cv2.polylines(
+            drawn, fixed, isClosed=False, color=colour, thickness=width, lineType=cv2.LINE_AA, shift=3
+        )
+    return drawn
 
 
 def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:

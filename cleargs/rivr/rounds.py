@@ -143,6 +143,7 @@ def repair(
     restored, source, deblurred = rules.restored(view, rendered, scene)
     explained = scene.explained(view)
     observed, mask = observation(view)
+    mask = scene.still(view, mask)  # regions that move are not repaired
     layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
     if rules.use_fused:
         fused = fuse(from_layer(layers["render"]), from_layer(layers["restored"]), rules.fuse_sigma)

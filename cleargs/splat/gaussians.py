@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -94,3 +95,18 @@ class Gaussians:
     def select(self, index: Tensor) -> Gaussians:
         """Return contiguous copies of the Gaussians at ``index``, a bool mask [N] or indices."""
         return Gaussians(**{name: tensor[index].contiguous() for name, tensor in self.tensors().items()})
+
+    def fault(self) -> str | None:
+        """Name the first parameter with NaN or infinity, and its number of such Gaussians; None if finite."""
+        tensors = self.tensors()
+        if self.device.type == "cpu":  # NumPy is much faster than torch here
+            finite = all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors.values())
+        else:  # waits for the GPU only once
+            finite = bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all())
+        if finite:
+            return None
+        for name, tensor in tensors.items():
+            sound = int(torch.isfinite(tensor).reshape(self.num, -1).all(1).sum())
+            if sound < self.num:
+                return f"{name} is not finite in {self.num - sound} of {self.num} Gaussians"
+        return None

@@ -8,6 +8,11 @@ import torch
 
 from cleargs.splat.gaussians import Gaussians
 
+Colour = tuple[float, float, float]
+"""sRGB in [0, 1]."""
+
+BLACK: Colour = (0.0, 0.0, 0.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -16,8 +21,8 @@ class Scene:
     gaussians: Gaussians
     antialias: bool = False
     """True: the opacities of splats smaller than a pixel are compensated (Mip-Splatting)."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour of the background, sRGB in [0, 1]."""
+    background: Colour = BLACK
+    """Colour of the background."""
 
     def to(self, device: torch.device | str) -> Scene:
         """Return the scene with its Gaussians on a device."""

@@ -35,6 +35,8 @@ class TrainingView:
     """Function that returns the image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and the mask [H, W] (True:
     the pixel counts) or None. The cache calls it when it needs the image, and again if it could not keep
     it."""
+    estimated: bool = False
+    """True if the camera's pose is an estimate, and not one of the input that fits the images."""
 
 
 class ViewDataset(torch.utils.data.Dataset[dict[str, Any]]):

@@ -95,6 +95,21 @@ def test_given_poses_have_a_place_of_their_own(shell: Shell, run: Path, truth: P
     assert (run / "eval" / "truth-given" / "eval.json").is_file()
 
 
+def test_refined_poses_are_a_second_figure(shell: Shell, tmp_path: Path) -> None:
+    """The figures at the given poses stay, in the table and in the JSON."""
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, [turned(camera, 1.0) for camera in cameras(3)])
+    truth = write_reference(tmp_path / "truth", scene, cameras(3))
+    options = (run, "--reference", truth, "--poses", "given", "--refine-poses", "8", *FAST)
+    _, table, _ = shell(*options)
+    assert len([line for line in table.splitlines() if "mean of 3" in line]) == 2
+    assert "g0, poses refined" in table
+    plain, refined = json.loads(shell(*options, "--json")[1])["evaluations"]
+    assert (plain["options"]["refine_poses"], refined["options"]["refine_poses"]) == (0, 8)
+    # A degree is 10 px of these cameras.
+    assert plain["means"]["psnr"] < 35 < 45 < refined["means"]["psnr"]
+
+
 def test_a_scene_file_and_renders(shell: Shell, run: Path, truth: Path, tmp_path: Path) -> None:
     result = tmp_path / "found.json"
     code, out, _ = shell(run / "g0" / "scene.ply", "--reference", truth, "-o", result, "--json", *FAST)
