@@ -19,7 +19,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cleargs.pipeline",),
     ("cleargs.run_results",),  # reads the results of a finished run
     ("cleargs.report", "cleargs.render"),
-    ("cleargs.api", "cleargs.api_parts"),
+    ("cleargs.api_parts",),
+    ("cleargs.api",),
     ("cleargs.stages", "cleargs.workflows"),
     ("cleargs.batch",),
     ("cleargs.cli",),

@@ -147,8 +147,8 @@ def _line(result: Result) -> str:
 def _print_plans(batch: Batch, as_json: bool) -> None:
     """Print hours, memory and disk of the missing stages, per scene and in total."""
     plans = [_plan_json(batch, scene) for scene in batch.scenes]
-    together = {"hours": sum, "memory_gb": max, "disk_gb": sum}
-    total = {name: combine(plan[name] for plan in plans) for name, combine in together.items()}
+    total = {name: sum(plan[name] for plan in plans) for name in ("hours", "memory_gb", "disk_gb")}
+    total["memory_gb"] = max(plan["memory_gb"] for plan in plans)  # the scenes run one after the other
     lines = []
     for plan in [*plans, {"scene": "total", **total, "note": f"{len(plans)} scenes"}]:
         cost = f"{plan['hours']:.2f} h, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
