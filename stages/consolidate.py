@@ -129,10 +129,6 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     write_repairs(context.out / "repairs.parquet", repairs)
 
     g0 = TrainedScene(context.inputs["g0"], context.device)
-    draft = context.settings["g0"].quality == "draft"
-    if draft:
-        reporter.info("consolidation: a draft is not consolidated; the scene is G0's, unchanged")
-        repairs, kept = [], set()
     start = TrainedScene(rivr, context.device) if repairs or kept else g0
     consolidated, trainings = start, []
     if repairs or kept:
