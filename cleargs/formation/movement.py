@@ -107,21 +107,12 @@ class Movement:
         self,
         frame_id: int,
         image: Tensor,  # [H, W, 3] sRGB, the render as the frame's camera saw it
-        render: Render,
-        margin: int,
+        render: Render,  # sharp, with depth
+        margin: int,  # pixels by which ``render`` is larger on every side
         target: Tensor,  # [H, W, 3] sRGB
-        mask: Tensor | None,  # [H, W]
+        mask: Tensor | None,  # [H, W] pixels that count by the user's mask
     ) -> None:
-        """Compare a frame with the scene, and find again what moves in it.
-
-        Args:
-            frame_id: The frame.
-            image: The scene as the frame's camera saw it.
-            render: The sharp render with depth.
-            margin: Pixels by which ``render`` is larger on every side.
-            target: The frame.
-            mask: Pixels that count by the user's mask, or None.
-        """
+        """Compare a frame, ``target``, with the scene, and find again what moves in it."""
         k, (height, width) = self._place[frame_id], image.shape[:2]
         assert render.depth is not None
         inner = slice(margin, margin + height), slice(margin, margin + width)
@@ -174,18 +165,11 @@ class Movement:
     def _elsewhere(
         self, k: int, row: NDArray[np.intp], column: NDArray[np.intp], depth: ArrayF32
     ) -> tuple[ArrayF32, NDArray[np.int64], ArrayF64]:
-        """Return what the other frames say of the places that cells of a frame show.
+        """Return what the other frames say of the places that C cells of frame ``k`` show at ``depth``.
 
-        Args:
-            k: Index of the frame.
-            row: Rows of the cells [C].
-            column: Columns of the cells [C].
-            depth: Camera z of the places [C].
-
-        Returns:
-            The median [C] of their differences, infinite where no other frame sees the place; the number of
-            frames [C] that see it and have been looked at; and the share [C] of the `NEAR_FRAMES` of these
-            with the nearest cameras, in which it moves.
+        These are the median [C] of their differences, infinite where no other frame sees the place; the
+        number of frames [C] that see it and have been looked at; and the share [C] of the `NEAR_FRAMES` of
+        these with the nearest cameras, in which it moves.
         """
         rows, columns = self._moves.shape[1:]
         fx, fy, cx, cy = self._lenses[k]

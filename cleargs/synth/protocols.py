@@ -112,19 +112,11 @@ class Fault:
 def plan_faults(
     protocol: Protocol,
     motions: Sequence[SimulatedMotion],
-    luminances: Sequence[float],
-    rate: float,
+    luminances: Sequence[float],  # `cleargs.synth.phone.metered_luminance`, for automatic exposure
+    rate: float,  # frames per second
     seed: int,
 ) -> list[Fault]:
-    """Choose the fault of each frame of a walk.
-
-    Args:
-        protocol: The protocol of the capture.
-        motions: Image motion of each frame.
-        luminances: `cleargs.synth.phone.metered_luminance` of each frame; used for automatic exposure.
-        rate: Frames per second.
-        seed: Seed of the random faults.
-    """
+    """Choose the fault of each frame of a walk."""
     scale = motions[0].lens.width / REFERENCE_WIDTH
     if protocol.mixed:
         return _mixed(motions, scale, np.random.default_rng([seed, Stream.MIXED_FAULTS]))
@@ -176,14 +168,7 @@ def noisy_poses(
     depth: float,
     seed: int,
 ) -> NDArray[np.float64]:  # [F, 3, 4]
-    """Return the given poses: ``poses`` with noise.
-
-    Args:
-        poses: Exact poses.
-        protocol: Levels of the noise.
-        depth: Mean depth of the capture, world units.
-        seed: Seed of the noise.
-    """
+    """Return the given poses: ``poses`` with the noise of ``protocol`` at this mean depth, world units."""
     rng = np.random.default_rng([seed, Stream.POSE_NOISE])
     turns = np.radians(protocol.rotation_noise) * rng.standard_normal((len(poses), 3))
     shifts = protocol.translation_noise * depth * rng.standard_normal((len(poses), 3))
