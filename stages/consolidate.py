@@ -49,11 +49,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
     "g0": TRAINED,
-    "rivr": (
-        *TRAINED,
-        "selection.parquet",
-        *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1)),
-    ),
+    "rivr": (*TRAINED, "selection.parquet", *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1))),
 }
 OUTPUTS = (*TRAINED, "train.parquet", "repairs.parquet", "before_after.png")
 LEFTOVERS: tuple[str, ...] = ()

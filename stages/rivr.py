@@ -311,13 +311,7 @@ def _repair_and_distil(
         for place, group in enumerate(groups):
             label = f"round {number}" + (f", group {place + 1} of {len(groups)}" if len(groups) > 1 else "")
             found = run_round(
-                number,
-                group.targets,
-                current,
-                rules,
-                context.out,
-                reporter,
-                label=f"{label}: candidates",
+                number, group.targets, current, rules, context.out, reporter, label=f"{label}: candidates"
             )
             rows += found
             kept = kept_raw(rows)

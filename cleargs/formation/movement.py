@@ -73,10 +73,7 @@ class Movement:
     """
 
     def __init__(
-        self,
-        cameras: Mapping[int, Camera],
-        tolerance: float,
-        known: Mapping[int, MaskBool] | None = None,
+        self, cameras: Mapping[int, Camera], tolerance: float, known: Mapping[int, MaskBool] | None = None
     ) -> None:
         self._tolerance = tolerance
         self._place = {frame_id: k for k, frame_id in enumerate(cameras)}

@@ -95,12 +95,7 @@ def search(
 
 
 def refine(
-    pair: FramePair,
-    model: Model,
-    motion: FrameMotion,
-    *,
-    pose: bool = False,
-    curve: bool = False,
+    pair: FramePair, model: Model, motion: FrameMotion, *, pose: bool = False, curve: bool = False
 ) -> list[MotionFit]:
     """Fit ``model`` again from the numbers of the last fit, at the finest level.
 

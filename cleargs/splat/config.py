@@ -115,12 +115,7 @@ class TrainConfig(Settings):
         "the factor of the quality",
     )
     begin: float = Field(0.0, ge=0, lt=1, description="start of this training in the schedule, as a fraction")
-    end: float = Field(
-        1.0,
-        gt=0,
-        le=1,
-        description="end of this training in the schedule, as a fraction",
-    )
+    end: float = Field(1.0, gt=0, le=1, description="end of this training in the schedule, as a fraction")
     background: tuple[Unit, Unit, Unit] | None = Field(
         None,
         description="sRGB behind the scene; unset = black, and in training a random colour at each step, so "
@@ -128,10 +123,7 @@ class TrainConfig(Settings):
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")
     coarse_share: float = Field(
-        0.25,
-        ge=0,
-        le=1,
-        description="fraction of the schedule, at its start, with reduced images; 0 = off",
+        0.25, ge=0, le=1, description="fraction of the schedule, at its start, with reduced images; 0 = off"
     )
 
     densify: bool = Field(True, description="split, move and add Gaussians during the training")

@@ -74,10 +74,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "gsotm-pn": Protocol(rotation_noise=0.4, translation_noise=0.005),
     # As with a depth sensor: the focal length of 7-Scenes is 13 % off, and its poses miss by 1.7 px.
     "camera": Protocol(
-        rotation_noise=0.4,
-        translation_noise=0.005,
-        focal_error=0.06,
-        distortion=(0.08, -0.03, 0.001, -0.001),
+        rotation_noise=0.4, translation_noise=0.005, focal_error=0.06, distortion=(0.08, -0.03, 0.001, -0.001)
     ),
     # Every fifth frame of a video with 30 frames per second and a shutter that is open 5/6 of the time.
     "phone": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True),
