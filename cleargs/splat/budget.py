@@ -39,7 +39,7 @@ def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
 def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: int) -> NDArray[np.float64]:
     """Estimate the wall seconds of each step on two idle cores, [length].
 
-    Later steps take longer, as the number of Gaussians grows from ``start``. ``megapixels`` are per frame, and
+    Later steps take longer, as the number of Gaussians grows from ``start``. ``megapixels`` are per frame.
     ``config`` has steps and budget (`resolve_config`).
     """
     step = config.first + np.arange(config.length)
@@ -58,8 +58,8 @@ def training_cost(
 ) -> tuple[float, float]:
     """Estimate the wall seconds of a training on two idle cores, and its GB of memory without the images.
 
-    It begins with ``start`` Gaussians (None: the maximum number). ``megapixels`` are per frame. Open steps and
-    budget are set as in `resolve_config`.
+    It begins with ``start`` Gaussians (None: the maximum number). ``megapixels`` are per frame. Open steps
+    and budget are set as in `resolve_config`.
     """
     pixels = round(frames * megapixels * 1e6)
     budget = config.budget_for(pixels)
