@@ -38,11 +38,7 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
 
     It is one Gaussian (59 numbers at SH degree 3) per 80 pixels (240 numbers, most seen by several frames),
     times the factor of the quality. Fewer than 40,000 reduce the PSNR of small captures by 1 dB.
-
-    Args:
-        pixels: Number of pixels in all active frames.
-        max_budget: Upper limit at standard quality.
-        quality: Quality of the run.
+    ``max_budget`` is the upper limit at standard quality.
     """
     standard = min(max(pixels // PIXELS_PER_GAUSSIAN, MIN_BUDGET), max_budget)
     return max(1, int(BUDGET_FACTOR[quality] * standard))
