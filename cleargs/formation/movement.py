@@ -42,7 +42,7 @@ MIN_OTHERS = 3
 """Fewest other frames that see a place where something can move."""
 NEAR_FRAMES, MAX_NEAR_SHARE = 8, 0.5
 """Number of the other frames with the nearest cameras, and the largest share of them in which the same place
-may move. Where it moves in more of them, something that does not move has been left out by mistake: the masks
+may move. If it moves in more of them, something that does not move has been left out by mistake: the masks
 keep it from being learned, and then it differs."""
 MIN_CELLS = 6
 """Fewest cells of a region that moves."""

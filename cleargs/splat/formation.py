@@ -48,7 +48,7 @@ class Formation(Protocol):
         progress: float,  # position in the schedule, 0 to 1
         target: Tensor,  # [H, W, 3] sRGB at this scale
         mask: Tensor | None,  # [H, W] pixels that count
-        render: Renderer,  # of the current scene
+        render: Renderer,  # renders the current scene
     ) -> Formed | None:
         """Return the image formation for a step on a view, or None to compare it with the plain render."""
 
