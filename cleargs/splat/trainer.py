@@ -117,8 +117,14 @@ class Trainer:
         self._log = TrainLog(self.length)
         self._image_gradients: dict[tuple[int, int], Tensor] = {}
         formed = "" if formation is None else formation.digest()
-        arguments = [*self._seed, self._earlier_steps, self._pseudo_share, pseudo_weight, formed]
-        self._fingerprint = _fingerprint(scene, weighted, config, arguments)
+        others: list[float | str] = [
+            *self._seed,
+            self._earlier_steps,
+            self._pseudo_share,
+            pseudo_weight,
+            formed,
+        ]
+        self._fingerprint = _fingerprint(scene, weighted, config, others)
         self.done = 0
 
     def run(
