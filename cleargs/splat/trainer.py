@@ -116,14 +116,8 @@ class Trainer:
         self._losses = LossAccumulator(self._device, config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._image_gradients: dict[tuple[int, int], Tensor] = {}
-        formed = "" if formation is None else formation.digest()
-        others: list[float | str] = [
-            *self._seed,
-            self._earlier_steps,
-            self._pseudo_share,
-            pseudo_weight,
-            formed,
-        ]
+        others: list[float | str] = [*self._seed, self._earlier_steps, self._pseudo_share, pseudo_weight]
+        others.append("" if formation is None else formation.digest())
         self._fingerprint = _fingerprint(scene, weighted, config, others)
         self.done = 0
 
