@@ -37,12 +37,8 @@ class OnnxExpert:
     """A restoration network in an ONNX file, applied to overlapping tiles (on a GPU in batches).
 
     The network maps an image [1, 3, H, W] or [1, H, W, 3], float32 sRGB in [0, 1], to an image of the same
-    size in either layout. Its first output is used. A fixed input size is the size of the tiles.
-
-    Args:
-        path: ONNX file.
-        name: Name for tables (None: the file name without its extension).
-        device: Device of the network, as `network_device` returns it.
+    size in either layout. Its first output is used. A fixed input size is the size of the tiles. ``name`` is
+    for tables (None: the file name without its extension); ``device`` is a result of `network_device`.
 
     Raises:
         InputError: The file is missing, is not an ONNX model, or has other inputs.

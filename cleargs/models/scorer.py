@@ -107,12 +107,9 @@ def information(image: ImageF32) -> float:
 class LearnedScorer:
     """A scoring network in an ONNX file, which maps [N, 3, H, W] float32 sRGB in [0, 1] to N scores.
 
-    Args:
-        path: ONNX file.
-        name: Name for tables (None: the file name without its extension).
-        tile: Side of tiles whose mean is the score, px, so that the score depends little on the size of the
-            image. None: the whole image, or tiles of the network's fixed input size.
-        device: Device of the network, as `network_device` returns it.
+    ``name`` and ``device`` are those of an `OnnxExpert`. ``tile`` is the side of tiles whose mean is the
+    score, px, so that the score depends little on the size of the image. None: the whole image, or tiles of
+    the network's fixed input size.
 
     Raises:
         InputError: The file is missing, is not an ONNX model, or has other inputs or outputs.
