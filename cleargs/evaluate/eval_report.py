@@ -30,6 +30,11 @@ _MEANINGS = {
 }
 _SCORE = "no-reference score; higher is better"
 
+_REGIONS = {
+    "far": "in which the scene shows something behind all sparse points of the view, or nothing",
+    "clipped": "with a channel of the reference of at least 254",
+}
+
 LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
 """Metrics whose lower values are better; of all others the higher values are."""
 
@@ -194,35 +199,31 @@ def read_report(path: Path) -> Report:
 
 def table_schema(metrics: Sequence[str]) -> pa.Schema:
     """Return the columns of the Parquet table: one row per image, one column per metric."""
-
-    def field(name: str, kind: pa.DataType, *, of: type[Figures] = ImageResult, prefix: str = "") -> pa.Field:
-        found = of.model_fields[name]
-        return column(
-            f"{prefix}{name}", kind, str(found.description), nullable=bool(prefix) or not found.is_required()
-        )
-
-    number, text = pa.float64(), pa.string()
     return pa.schema(
         [
-            column("subject", text, str(Evaluation.model_fields["subject"].description)),
-            column("adjusted", text, "fitted to the reference first: colours, poses, or nothing"),
-            field("name", text),
-            *(field(side, pa.int32()) for side in ("width", "height")),
-            *(column(name, number, _MEANINGS.get(name, _SCORE), nullable=True) for name in metrics),
+            column("subject", pa.string(), "stage, or name of the scene file or of the folder of images"),
+            column("adjusted", pa.string(), "fitted to the reference first: colours, poses, or nothing"),
+            column("name", pa.string(), "stem of the reference's file"),
+            column("width", pa.int32(), "px"),
+            column("height", pa.int32(), "px"),
+            *(column(name, pa.float64(), _MEANINGS.get(name, _SCORE), nullable=True) for name in metrics),
             *(
-                column(
-                    f"{part}_{figure}",
-                    number,
-                    f"{figure}: {ImageResult.model_fields[part].description}",
-                    nullable=True,
-                )
-                for part in ("far", "clipped")
-                for figure in Region.model_fields
+                column(f"{region}_{figure}", pa.float64(), words, nullable=True)
+                for region, where in _REGIONS.items()
+                for figure, words in (("share", f"of the pixels, {where}"), ("psnr", f"dB, {where}"))
             ),
-            *(field(name, number) for name in ("psnr_colour_aligned", "psnr_white", "psnr_between")),
-            *(field(name, text) for name in ("prediction", "reference")),
-            field("colour", pa.list_(number)),
-            *(field(name, number, of=Refinement, prefix="refined_") for name in ("rotation_deg", "shift")),
+            column(
+                "psnr_colour_aligned", pa.float64(), "dB, colours aligned to the reference", nullable=True
+            ),
+            column("psnr_white", pa.float64(), "dB, of the scene over white", nullable=True),
+            column("psnr_between", pa.float64(), "dB, between background and white", nullable=True),
+            column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
+            column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
+            column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),
+            column("refined_rotation_deg", pa.float64(), "angle of pose refinement", nullable=True),
+            column(
+                "refined_shift", pa.float64(), "movement of the camera centre, scene units", nullable=True
+            ),
         ]
     )
 
