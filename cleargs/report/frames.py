@@ -20,6 +20,7 @@ from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frame import from_row
 from cleargs.formation.frames import view_of
 from cleargs.formation.motion import pixel_paths
+from cleargs.formation.movement import read_movement, still_pixels
 from cleargs.formation.table import FORMATION
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_rgb, to_uint8
@@ -212,10 +213,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     moving: dict[int, MaskBool] = {}
     if final := last_scene(stages):
         if (path := run / final / "movement.parquet").is_file():
-            for row in read_any_table(path).to_pylist():
-                shape = row["rows"], row["columns"]
-                bits = np.unpackbits(np.frombuffer(row["moves"], np.uint8), count=shape[0] * shape[1])
-                moving[row["frame_id"]] = bits.reshape(shape) > 0
+            moving = read_movement(path)
         exposure = read_exposure(run / final / "exposure.parquet")
         if exposure.enabled:
             affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
@@ -387,8 +385,8 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.moving is not None:
         height, width = images["observed"].shape[:2]
-        cells = cv2.resize(row.moving.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        tint = np.where(cells[..., None] > 0, _UNUSED, images["observed"]).astype(np.uint8)
+        still = still_pixels(row.moving, height, width)[..., None]
+        tint = np.where(still, images["observed"], _UNUSED).astype(np.uint8)
         images["moving"] = np.asarray(cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0), np.uint8)
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")

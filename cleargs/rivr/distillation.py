@@ -89,7 +89,8 @@ class TrainedScene:
         self.exposure = self._written_exposure if self._written_exposure.enabled else None
         """The affines of the frames; None where compensation is off."""
         self.formations, self._weights = read_formation(folder / FORMATION)
-        self.moving = read_movement(folder / MOVEMENT)
+        # A scene of an older version has no such table.
+        self.moving = read_movement(folder / MOVEMENT) if (folder / MOVEMENT).is_file() else {}
         """Cells that move, by frame_id."""
         self._engine = rasteriser_for(device)
 
