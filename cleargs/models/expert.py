@@ -13,21 +13,13 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import RegistryEntry, load_network
+from cleargs.models.registry import Network, RegistryEntry, load_network
 from cleargs.models.tiling import map_tiled
 from cleargs.types import ImageF32
 
 
-class Expert(Protocol):
+class Expert(Network, Protocol):
     """A frozen image restorer."""
-
-    @property
-    def name(self) -> str:
-        """Short name for tables."""
-
-    @property
-    def digest(self) -> str:
-        """Digest of the weights, part of the store key."""
 
     def restore(self, image: ImageF32, *, threads: int = 1) -> ImageF32:
         """Restore an image [H, W, 3] float32 sRGB in [0, 1]; ``threads`` does not change any bit."""

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 from pydantic import Field
 
@@ -26,6 +26,18 @@ State = Literal["shipped", "installed", "not installed", "incomplete"]
 Converter = Literal["lpips", "spandrel", "musiq", "clip-iqa"]
 
 _SHA256 = r"^[0-9a-f]{64}$"
+
+
+class Network(Protocol):
+    """A model that works on images."""
+
+    @property
+    def name(self) -> str:
+        """Short name for tables."""
+
+    @property
+    def digest(self) -> str:
+        """Digest of the weights, part of the store key."""
 
 
 class Source(FrozenModel):
