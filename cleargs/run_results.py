@@ -207,8 +207,11 @@ class Prepared:
     def views(self, weights: Mapping[int, float] | None = None) -> list[TrainingView]:
         """Return the views of a training: the frames with a pose that are not held out.
 
-        They read their images when these are needed. ``weights`` is frame_id -> weight (default: 1 for all).
-        Frames with weight 0 are left out.
+        Args:
+            weights: frame_id -> weight (default: 1 for all). Frames with weight 0 are left out.
+
+        Returns:
+            Views that read their images when these are needed.
         """
         from cleargs.formation.frames import real_views
 
