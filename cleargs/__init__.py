@@ -9,12 +9,10 @@ __version__ = "0.2.0"
 _HOMES = {
     "run": "api",
     **dict.fromkeys(("open_run", "Run", "StageResults", "open_prepared", "Prepared"), "run_results"),
-    **dict.fromkeys(("initialise", "train", "render_view", "save", "load", "export", "film"), "api"),
-    **dict.fromkeys(
-        ("score_frames", "score", "restore", "deblur", "evaluate_scene"),
-        "api",
-    ),
-    "write_report": "api",
+    **dict.fromkeys(("initialise", "train", "render_view", "save", "load"), "api_parts"),
+    **dict.fromkeys(("export", "film"), "api"),
+    **dict.fromkeys(("score_frames", "score", "restore"), "api_parts"),
+    **dict.fromkeys(("deblur", "evaluate_scene", "write_report"), "api"),
     "make_capture": "synth.synthetic_capture",
     "Camera": "splat.camera",
     "CleargsError": "errors",

@@ -19,6 +19,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cleargs.pipeline",),
     ("cleargs.run_results",),  # reads the results of a finished run
     ("cleargs.report", "cleargs.render"),
+    ("cleargs.api_parts",),
     ("cleargs.api",),
     ("cleargs.stages", "cleargs.workflows"),
     ("cleargs.batch",),

@@ -16,7 +16,9 @@ from benchmarks.comparison.pictures import find_image
 from benchmarks.comparison.scenes import Sample, SceneRecipe, evaluate_views, make_scenes
 from benchmarks.comparison.tables import Table
 from benchmarks.comparison.variants import VARIANTS, find_variants
+from benchmarks.images import read_rgb_float
 from cleargs.base_model import FrozenModel
+from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError, ConfigError, InputError
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
@@ -216,14 +218,15 @@ def showcase(path: Path, out: Path, found: Comparison) -> bool:
     if scene is None or "full" not in cells:
         return False
     view = sorted(path.stem for path in (out / cells["full"].evaluation).glob("*.png"))[0]
-    images = scene.run / "ingest" / "images"
-    tiles = [Tile(find_image(images, SHOWN), "photograph")]
+    ingest = scene.run / "ingest"
+    images = {Path(frame.name).stem: ingest / frame.image for frame in load_frames(ingest)}
+    tiles = [Tile(read_rgb_float(images[SHOWN]), "photograph")]
     tiles += [
         Tile(find_image(out / cells[name].evaluation, view), label)
         for name, label in (("all-view", "all frames alike"), ("full", "ClearGS"))
         if name in cells
     ]
-    tiles.append(Tile(find_image(images, view), "reference"))
+    tiles.append(Tile(read_rgb_float(images[view]), "reference"))
     write_rgb(path, contact_sheet([tiles], tile_width=480))
     return True
 

@@ -73,14 +73,10 @@ class SceneJob:
 
 
 def read_scenes(path: Path) -> list[SceneJob]:
-    """Return the scenes of a sheet. Settings and inputs are not checked yet.
+    """Return the scenes of a sheet: CSV if the name ends with ``.csv``, TOML otherwise.
 
-    Args:
-        path: The sheet: CSV if the name ends with ``.csv``, TOML otherwise.
-
-    Raises:
-        SheetError: The sheet has mistakes. All of them are listed.
-        InputError: The file cannot be read as a sheet.
+    Settings and inputs are not checked yet. Raises SheetError with all mistakes, and InputError if the file
+    cannot be read.
     """
     try:
         text = read_text(path)

@@ -12,11 +12,11 @@ import click
 from cleargs.batch.loop import Batch, Result, write_summary
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.common import (
+    answer,
     fail_below_option,
     json_option,
     output_option,
     partial_option,
-    print_json,
     quality_option,
     quiet_option,
     report_below,
@@ -125,12 +125,14 @@ def batch(
         except CleargsError as error:  # the scenes themselves may have succeeded
             reporter.warn(f"no report was written: {error}; {error.hint}")
     states = Counter(result.state for result in results)
-    if as_json:
-        print_json([asdict(result) for result in results])
-    else:
-        click.echo("\n".join(_line(result) for result in results))
-        click.echo(", ".join(f"{count} {state}" for state, count in states.items()))
-        click.echo(f"summary: {root / 'summary.csv'}" + (f"\nreport: {page}" if page else ""))
+    answer(
+        as_json,
+        [asdict(result) for result in results],
+        *map(_line, results),
+        ", ".join(f"{count} {state}" for state, count in states.items()),
+        f"summary: {root / 'summary.csv'}",
+        *([f"report: {page}"] if page else []),
+    )
     numbers = ("frames", "frames_placed", "psnr_unseen", "minutes", "memory_gb", "disk_gb")
     figures = {result.scene: {name: getattr(result, name) for name in numbers} for result in results}
     below = report_below(figures, fail_below)
@@ -145,17 +147,13 @@ def _line(result: Result) -> str:
 def _print_plans(batch: Batch, as_json: bool) -> None:
     """Print hours, memory and disk of the missing stages, per scene and in total."""
     plans = [_plan_json(batch, scene) for scene in batch.scenes]
-    total = {
-        "hours": sum(plan["hours"] for plan in plans),
-        "memory_gb": max(plan["memory_gb"] for plan in plans),
-        "disk_gb": sum(plan["disk_gb"] for plan in plans),
-    }
-    if as_json:
-        print_json({"folder": str(batch.folder), "device": batch.device, **total, "scenes": plans})
-        return
+    total = {name: sum(plan[name] for plan in plans) for name in ("hours", "memory_gb", "disk_gb")}
+    total["memory_gb"] = max(plan["memory_gb"] for plan in plans)  # the scenes run one after the other
+    lines = []
     for plan in [*plans, {"scene": "total", **total, "note": f"{len(plans)} scenes"}]:
         cost = f"{plan['hours']:.2f} h, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
-        click.echo(f"{plan['scene']}: {cost}; {plan['note']}")
+        lines.append(f"{plan['scene']}: {cost}; {plan['note']}")
+    answer(as_json, {"folder": str(batch.folder), "device": batch.device, **total, "scenes": plans}, *lines)
 
 
 def _plan_json(batch: Batch, scene: SceneJob) -> dict[str, Any]:

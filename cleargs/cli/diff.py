@@ -9,19 +9,14 @@ from typing import Any
 import click
 
 from cleargs.cli.common import FOLDER, json_option, print_json
+from cleargs.cli.show import LABELS
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.report.report_json import linked_manifests
 
-FIGURES = {
-    "frames": "frames",
-    "registered": "frames with a pose",
-    "gaussians": "Gaussians",
-    "psnr_unseen": "PSNR on pixels that no training saw, dB",
-    "repairs": "repairs",
-}
-"""Figure of a stage's manifest -> its label."""
+FIGURES = ("frames", "registered", "gaussians", "psnr_unseen", "repairs")
+"""Figures of a stage's manifest."""
 
 
 @click.command(
@@ -83,7 +78,7 @@ def _figures(run: RunSpec, dag: Dag) -> Iterator[tuple[str, Any]]:
     made = linked_manifests(run.folder, dag.names)
     for name, manifest in made.items():
         known = [key for key in FIGURES if manifest.summary.get(key) is not None and name != "rva"]
-        yield from ((f"{name}: {FIGURES[key]}", manifest.summary[key]) for key in known)
+        yield from ((f"{name}: {LABELS.get(key, key)}", manifest.summary[key]) for key in known)
         yield f"{name}: time, s", round(manifest.seconds, 1)
     yield "all stages: time, s", round(sum(manifest.seconds for manifest in made.values()), 1)
     for file in sorted(run.folder.glob("eval/*/eval.json")):

@@ -32,8 +32,6 @@ LIBRARIES = (
     "pyarrow",
     "av",
 )
-MIN_MEMORY_GB = 4.0
-MIN_DISK_GB = 5.0
 
 
 class Finding(NamedTuple):
@@ -60,20 +58,8 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
         Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
         *(_library(name) for name in LIBRARIES),
         Finding("cores", "ok", str(usable_cores())),
-        _room(
-            "memory",
-            available_memory(),
-            MIN_MEMORY_GB,
-            "",
-            f"a run may want {MIN_MEMORY_GB:.0f} GB: lower ingest.max_size",
-        ),
-        _room(
-            "disk",
-            shutil.disk_usage(folder).free,
-            MIN_DISK_GB,
-            f" at {folder.absolute()}",
-            "cleargs gc frees what no run needs",
-        ),
+        _room("memory", available_memory(), 4.0, "a run may want 4 GB: lower ingest.max_size"),
+        _room("disk", shutil.disk_usage(folder).free, 5.0, "cleargs gc frees what no run needs"),
         device,
         Finding("configuration", "ok", f"{'' if config.is_file() else 'no '}{config}"),
         Finding("pace", "ok", speed),
@@ -112,10 +98,9 @@ def _library(name: str) -> Finding:
         return Finding(name, "bad", "not installed: install cleargs again")
 
 
-def _room(what: str, free: float, least_gb: float, place: str, advice: str) -> Finding:
+def _room(what: str, free: float, least_gb: float, advice: str) -> Finding:
     """Return a finding about ``free`` bytes, with ``advice`` if there are too few."""
-    words = f"{free / 1e9:.1f} GB free{place}"
-    enough = free / 1e9 >= least_gb
+    enough, words = free / 1e9 >= least_gb, f"{free / 1e9:.1f} GB free"
     return Finding(what, "ok" if enough else "note", words if enough else f"{words}; {advice}")
 
 

@@ -120,7 +120,6 @@ stages and options stay there as long as their scenes do.
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
 @fail_below_option("psnr, ssim ...")
 @threads_option
-@click.option("-v", "--per-image", is_flag=True, help="Show every image in the table.")
 @json_option
 @quiet_option
 @click.pass_obj
@@ -140,7 +139,6 @@ def eval(
     output: Path | None,
     fail_below: dict[str, float],
     threads: int,
-    per_image: bool,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -194,11 +192,7 @@ def eval(
     if as_json:
         print_json(report.document())
     else:
-        if line := _seen_before(report):
-            click.echo(line)
-        _print(report, per_image, output)
-        for line in filter(None, map(_with_colours_aligned, report.evaluations)):
-            click.echo(line)
+        _print(report, output)
     return int(report_below({found.subject: found.means for found in report.evaluations}, fail_below))
 
 
@@ -267,7 +261,7 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
 # -- on the terminal ---------------------------------------------------------------------------------------
 
 
-def _print(report: Report, per_image: bool, output: Path | None) -> None:
+def _print(report: Report, output: Path | None) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -275,16 +269,16 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
 
     first = report.evaluations[0]
     metrics = [name for name in first.options.metrics if name not in first.unavailable]
-    table = Table("subject", "image", box=None, header_style="bold")
+    table = Table("subject", "images", box=None, header_style="bold")
     for metric in metrics:
         arrow = "↓" if metric in LOWER_IS_BETTER else "↑"
         table.add_column(f"{_LABELS.get(metric, Path(metric).stem)} {arrow}", justify="right")
     for evaluation in report.evaluations:
-        shown = [(image.name, image.values) for image in evaluation.images] if per_image else []
-        for name, values in [*shown, (f"mean of {len(evaluation.images)}", evaluation.means)]:
-            figures = (_figure(metric, values[metric]) for metric in metrics)
-            table.add_row(_subject(evaluation), name, *figures)
+        figures = (_figure(metric, evaluation.means[metric]) for metric in metrics)
+        table.add_row(_subject(evaluation), f"mean of {len(evaluation.images)}", *figures)
     console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
+    if line := _seen_before(report):
+        console.print(line)
     console.print(table)
     for evaluation in report.evaluations:
         console.print(_regions(evaluation))
@@ -293,6 +287,8 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
         console.print(f"{metric}: {reason}")
     if output is not None:
         console.print(f"written: {output}")
+    for line in filter(None, map(_with_colours_aligned, report.evaluations)):
+        console.print(line)
 
 
 def _subject(evaluation: Evaluation) -> str:

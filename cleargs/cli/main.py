@@ -176,12 +176,11 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             return 1, "out of memory", "lower ingest.max_size or ingest.max_frames, or close other programs"
         case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return 1, "no space left on the disk", "free some space (cleargs gc), or choose another --store"
-        case OSError() if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
-            where = f": {error.filename}" if error.filename else ""
-            return 2, f"{error.strerror}{where}", "choose another path"
         case OSError():
-            where = f": {error.filename}" if error.filename else ""
-            return 1, f"{error.strerror or _one_line(error)}{where}", "check the disk and its permissions"
+            cause = f"{error.strerror or _one_line(error)}{f': {error.filename}' if error.filename else ''}"
+            if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+                return 2, cause, "choose another path"
+            return 1, cause, "check the disk and its permissions"
         case _:
             cause = f"unexpected {type(error).__name__}: {_one_line(error)}"
             return 1, cause, "repeat the command with --debug to see the traceback, and please report it"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from cleargs.cli.common import FOLDER, answer, json_option, print_json
+from cleargs.cli.common import FOLDER, answer, json_option
 from cleargs.errors import InputError
 from cleargs.models.registry import Source, find_model, load_registry, model_dir, state
 from cleargs.models.registry import verify as verify_model
@@ -33,19 +33,18 @@ def list_models(directory: Path | None, as_json: bool) -> None:
     """List all models, with their state and source."""
     folder = directory or model_dir()
     entries = load_registry()
-    if as_json:
-        print_json([entry.model_dump(mode="json") | {"state": state(entry, folder)} for entry in entries])
-        return
+    found = [entry.model_dump(mode="json") | {"state": state(entry, folder)} for entry in entries]
+    lines = []
     for entry in entries:
-        click.echo(f"{entry.name:<18} {state(entry, folder):<14} {entry.task}")
+        lines.append(f"{entry.name:<18} {state(entry, folder):<14} {entry.task}")
         if entry.source is not None:
             facts = [entry.source.label, _size(entry.source), entry.licence]
             if not entry.commercial:
                 facts.append("NOT for commercial use")
             if not entry.source.verified:
                 facts.append("unverified: its publisher gives no full digest")
-            click.echo(f"{'':<33} {', '.join(fact for fact in facts if fact)}")
-    click.echo(f"folder: {folder}")
+            lines.append(f"{'':<33} {', '.join(fact for fact in facts if fact)}")
+    answer(as_json, found, *lines, f"folder: {folder}")
 
 
 @models.command()
@@ -83,18 +82,16 @@ def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> Non
     chosen = [find_model(name) for name in names] or [
         entry for entry in load_registry() if state(entry, folder) != "not installed"
     ]
-    faults: dict[str, InputError | None] = {}
+    faults: dict[str, InputError] = {}
     for entry in chosen:
         try:
             verify_model(entry, folder)
-            faults[entry.name] = None
         except InputError as error:
             faults[entry.name] = error
-    found = {name: str(fault or "sound") for name, fault in faults.items()}
+    found = {entry.name: str(faults.get(entry.name, "sound")) for entry in chosen}
     answer(as_json, found, *(f"{name}: {words}" for name, words in found.items()))
     for fault in faults.values():
-        if fault is not None:
-            raise fault
+        raise fault
 
 
 def _size(source: Source) -> str:

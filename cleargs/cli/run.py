@@ -199,12 +199,13 @@ def run(
         for line in lines:
             context.meta[LOG](line)
     if as_json:
-        print_json([outcome_json(outcome) for outcome in outcomes])
+        facts = ({"stage": one.stage, "how": one.how, "folder": str(one.folder)} for one in outcomes)
+        print_json([fact | manifest_json(one.manifest) for fact, one in zip(facts, outcomes, strict=True)])
     else:
         print_lines(outcomes, lines)
     if opens and page is not None:
         click.launch(page.as_uri())
-    return exit_code(outcomes)
+    return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
 
 
 def _is_user_default(context: click.Context, name: str) -> bool:
@@ -278,11 +279,6 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
 # -- outcomes and plans -------------------------------------------------------------------------------------
 
 
-def exit_code(outcomes: Sequence[StageOutcome]) -> int:
-    """Return 0, or 3 if something is missing."""
-    return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
-
-
 def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:
     """Print missing outputs on stderr, then the ``lines`` of `outcome_lines` on stdout."""
     last = outcomes[-1].manifest
@@ -317,14 +313,14 @@ def outcome_lines(outcomes: Sequence[StageOutcome], run: Path, report: Path | No
 
 
 def _extent(summaries: Summaries) -> str:
-    """Return the numbers of placed, strong and repaired frames, as far as they are known."""
+    """Return the numbers of placed, reliable and repaired frames, as far as they are known."""
     ingest, consolidate = summaries.get("ingest", {}), summaries.get("consolidate", {})
     words = []
     if "registered" in ingest and "frames" in ingest:
         words.append(f"{ingest['registered']} of {ingest['frames']} frames placed")
     if "roles" in summaries.get("rva", {}):
-        words.append(f"{summaries['rva']['roles']['strong']} strong")
-    if "repairs" in consolidate:
+        words.append(f"{summaries['rva']['roles']['strong']} reliable")
+    if consolidate.get("repairs"):
         words.append(f"{consolidate['repairs']} repaired")
     return f" ({', '.join(words)})" if words else ""
 
@@ -370,12 +366,6 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
     if summaries.get("ingest", {}).get("test"):
         return f"cleargs eval {quote(str(run))}"
     return f"cleargs export {quote(str(run))} -o {quote(f'{run.absolute().name}.sog')}"
-
-
-def outcome_json(outcome: StageOutcome) -> dict[str, Any]:
-    """Return an outcome as JSON values."""
-    facts = {"stage": outcome.stage, "how": outcome.how, "folder": str(outcome.folder)}
-    return {**facts, **manifest_json(outcome.manifest)}
 
 
 def print_plans(plans: list[StagePlan], as_json: bool) -> None:

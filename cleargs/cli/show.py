@@ -232,12 +232,10 @@ def frame_rows(
     settings: Mapping[str, Any],
     repairs: Sequence[Mapping[str, Any]] | None,
 ) -> list[dict[str, Any]]:
-    """Return role, scores, worst cue, reason and repair of every frame.
+    """Return role, scores, worst cue, reason and repair of each row of ``rva/frames.parquet``.
 
-    Args:
-        rows: The rows of ``rva/frames.parquet``.
-        settings: The settings of RVA that made these rows.
-        repairs: The rows of ``rivr/selection.parquet``; None before RIVR, when frames have no "repair".
+    ``settings`` are those of RVA that made the rows. ``repairs`` are the rows of ``rivr/selection.parquet``;
+    None before RIVR, when frames have no "repair".
     """
     from cleargs.report.frames import worst_cue
 
@@ -409,13 +407,10 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
 
 
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:
-    """Print a table without lines. Brackets in cells are not treated as markup.
+    """Print a table without lines. Without ``columns``, which are the heads, the first column holds labels.
 
-    Args:
-        rows: The cells.
-        columns: The heads. Without them, the first column holds labels.
-        title: The line above the table.
-        wraps: Head of the only column whose cells may wrap; the columns are then closer together.
+    Only the column with the head ``wraps`` may wrap; the columns are then closer together. Brackets in cells
+    are not treated as markup.
     """
     gap = (0, 1 if wraps else 2, 0, 0)
     table = Table(*columns, box=None, header_style="bold", padding=gap, pad_edge=False)

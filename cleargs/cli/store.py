@@ -87,19 +87,18 @@ def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) ->
             continue  # the stage ran with other settings, which `cleargs status` shows
         files = named_files(place)
         for name in sorted(before.keys() | files.keys()):
-            change = None
-            if name not in files:
-                change = " is missing"
-            elif name not in before:
-                change = " is new"
-            else:
-                try:
-                    if store.memo.digests_of(files[name], rehash=True)[""] != before[name]:
-                        change = " has other content"
-                except InputError as error:
-                    change = f": {error}"
-            if change:
-                yield StoreFault("changed", stage, f"{role} {name}".rstrip() + change)
+            try:
+                if name not in files:
+                    change = " is missing"
+                elif name not in before:
+                    change = " is new"
+                elif store.memo.digests_of(files[name], rehash=True)[""] != before[name]:
+                    change = " has other content"
+                else:
+                    continue
+            except InputError as error:
+                change = f": {error}"
+            yield StoreFault("changed", stage, f"{role} {name}".rstrip() + change)
 
 
 @click.command(

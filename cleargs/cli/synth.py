@@ -8,13 +8,8 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import completed, json_option, parse_size, print_json
+from cleargs.cli.common import answer, completed, json_option, parse_size
 from cleargs.cli.progress_bars import make_reporter
-
-PROTOCOL_HELP = (
-    "Degradations: sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, tremor, gsotm-mb, "
-    "gsotm-rs, gsotm-mb-rs, gsotm-pn, camera, phone, moving or moving-severe."
-)
 
 
 def _protocols() -> Iterable[str]:
@@ -40,6 +35,7 @@ Protocols, with mean lengths at a width of 640 px:
   tremor                                 motion blur of 12 px along bent paths of a hand that holds still
   gsotm-mb, gsotm-rs, gsotm-mb-rs        motion blur of 8 px, rolling shutter of 12 px, or both
   gsotm-pn                               sharp frames with inexact poses
+  camera                                 the same, with an inexact focal length and distortion
   phone                                  degradations of a phone's video
   moving, moving-severe                  the same, with a person, a thing put elsewhere and a flicker
 """
@@ -50,7 +46,7 @@ Protocols, with mean lengths at a width of 640 px:
     default="mixed",
     show_default=True,
     shell_complete=completed(_protocols),
-    help=PROTOCOL_HELP,
+    help="Degradations; see below.",
 )
 @click.option(
     "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="Number of frames."
@@ -67,17 +63,7 @@ Protocols, with mean lengths at a width of 640 px:
     help="Frame rate of OUT/capture.mp4, which then shows the whole walk; --frames have ground truth.",
 )
 @json_option
-def synth(
-    out: Path,
-    protocol: str,
-    frames: int,
-    size: tuple[int, int],
-    seed: int,
-    video: bool,
-    seconds: float | None,
-    fps: float | None,
-    as_json: bool,
-) -> None:
+def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> None:
     """Make a synthetic handheld capture of a procedural room in the new folder OUT.
 
     OUT/images and OUT/transforms.json are the capture. OUT/truth holds the ground truth: sharp views with
@@ -85,38 +71,18 @@ def synth(
     """
     from cleargs.synth.synthetic_capture import make_capture
 
-    summary = make_capture(
-        out,
-        protocol,
-        frames=frames,
-        width=size[0],
-        height=size[1],
-        seed=seed,
-        reporter=make_reporter(),
-        video=video,
-        seconds=seconds,
-        fps=fps,
-    )
-    if as_json:
-        print_json(summary)
-    else:
-        print_capture(out, summary)
-
-
-def print_capture(out: Path, summary: dict[str, Any]) -> None:
-    """Print the ``summary`` of `cleargs.synth.synthetic_capture.make_capture` for the capture in ``out``."""
-    width = summary["width"]
-    click.echo(
-        f"{summary['frames']} frames of {summary['protocol']!r} in {out}; ground truth in {out / 'truth'}"
-    )
-    click.echo(_line("true blur", summary["blur_px"], width))
+    summary = make_capture(out, width=size[0], height=size[1], reporter=make_reporter(), **options)
+    frames, width = f"{summary['frames']} frames of {summary['protocol']!r}", summary["width"]
+    lines = [f"{frames} in {out}; ground truth in {out / 'truth'}"]
+    lines.append(_line("true blur", summary["blur_px"], width))
     if summary["rolling_shutter_px"]["max"] > 0:
-        click.echo(_line("true rolling-shutter skew", summary["rolling_shutter_px"], width))
+        lines.append(_line("true rolling-shutter skew", summary["rolling_shutter_px"], width))
     if (noise := summary["pose_noise"]) is not None:
-        click.echo(
+        lines.append(
             f"noise of the given poses, per axis: {noise['rotation_deg']:.2f} degrees and "
             f"{noise['translation']:.4f} world units"
         )
+    answer(as_json, summary, *lines)
 
 
 def _line(what: str, pixels: dict[str, Any], width: int) -> str:

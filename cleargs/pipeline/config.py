@@ -60,16 +60,10 @@ def load_config(
     overrides: Sequence[str] = (),
     seed: int | None = None,
 ) -> Config:
-    """Return the checked configuration of a recipe.
+    """Return the checked configuration of a recipe: a name, the path of a TOML file, or a document.
 
-    Args:
-        dag: The stages, whose models check the settings.
-        recipe: A name, the path of a TOML file, or a document.
-        overrides: Settings as ``a.b=value``, which replace those of the recipe; the last one wins.
-        seed: Seed that replaces the recipe's.
-
-    Raises:
-        ConfigError: The recipe is unknown or cannot be read, or a setting is unknown or out of range.
+    ``overrides`` are settings as ``a.b=value``, which replace those of the recipe; the last one wins. Raises
+    ConfigError if the recipe cannot be read, or a setting is unknown or out of range.
     """
     document = read_recipe(recipe) if isinstance(recipe, str) else recipe
     for text in overrides:

@@ -74,11 +74,8 @@ def differences(
 ) -> list[str]:
     """Return one readable line per difference between two keys.
 
-    Args:
-        old: The parts of the first key.
-        new: The parts of the second key.
-        old_files: For the first key: "STAGE/PATH" (an input) or a role (an external) -> file -> digest.
-        new_files: The same for the second key. With both, a line can name the files that changed.
+    The files are "STAGE/PATH" (an input) or a role (an external) -> file -> digest, so that a line can name
+    those that changed.
     """
     lines = []
     if old.version != new.version:

@@ -73,13 +73,7 @@ def preview_of(found: RunningStage, store: Path) -> Preview | None:
 def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[RecordingReporter]:
     """Yield a reporter that forwards to ``reporter`` and writes the progress of ``stage`` into ``run``.
 
-    The progress file is removed when the block ends.
-
-    Args:
-        reporter: Receives all tasks and messages.
-        run: The run folder.
-        stage: Name of the running stage.
-        work: Work folder of the stage in the store.
+    ``work`` is the work folder of the stage in the store. The progress file is removed when the block ends.
     """
     try:
         yield RecordingReporter(

@@ -19,13 +19,8 @@ from cleargs.progress import Reporter
 def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterator[bool | None]:
     """Hold the lock file ``path`` for the block. The kernel releases the lock when the process ends.
 
-    Args:
-        path: The lock file; created if it does not exist.
-        shared: Take a lock that several processes may hold at the same time.
-        wait: Wait for another holder. Otherwise, the block runs without the lock.
-
-    Yields:
-        True with the lock, False without it, None on a file system without locks.
+    Several processes may hold a ``shared`` lock. Without ``wait``, the block also runs without the lock.
+    Yields True with the lock, False without it, None on a file system without locks.
     """
     while True:
         with disk_errors(path):
@@ -46,15 +41,10 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
 
 @contextmanager
 def exclusive_lock(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
-    """Hold the lock file ``path``; report another holder and wait for it.
+    """Hold the lock file ``path``; report another holder of the work ``what`` and wait for it.
 
-    Args:
-        path: The lock file. The holder writes its process and host into it.
-        reporter: Receives the message about another holder.
-        what: Name of the locked work, for the message.
-
-    Yields:
-        True with the lock; False on a file system without locks, where other processes may do the same work.
+    The holder writes its process and host into the file. Yields True with the lock; False on a file system
+    without locks, where other processes may do the same work.
     """
     with ExitStack() as stack:
         held = stack.enter_context(file_lock(path, wait=False))

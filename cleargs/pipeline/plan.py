@@ -88,15 +88,10 @@ class Planner:
     _estimates: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False)
 
     def stage_key(self, name: str, done: Mapping[str, Manifest], *, rehash: bool = False) -> StageKey:
-        """Return the key of the stage ``name``.
+        """Return the key of the stage ``name``, whose upstream stages have the manifests ``done``.
 
-        Args:
-            name: The stage.
-            done: The manifests of the upstream stages.
-            rehash: Read every external file again instead of using digests from the memo.
-
-        Raises:
-            InputError: An external (the capture, a model) cannot be read.
+        With ``rehash``, every external file is read again instead of using digests from the memo. Raises
+        InputError if an external (the capture, a model) cannot be read.
         """
         stage, config = self.dag.load(name), self.run.config.effective[name]
         inputs, origins = self.inputs(name, done)

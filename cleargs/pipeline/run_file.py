@@ -141,13 +141,7 @@ def read_source(folder: Path) -> Path | None:
 def read_run_file(
     folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None
 ) -> RunSpec:
-    """Read the run in ``folder``.
-
-    Args:
-        folder: The run folder.
-        dag: The stages, whose models check the settings.
-        store: Store to use instead of that in ``run.toml``.
-        device: Device to use instead of that in ``run.toml``.
+    """Read the run in ``folder``. ``store`` and ``device`` replace those in ``run.toml``.
 
     Raises:
         InputError: The folder has no ``run.toml``.

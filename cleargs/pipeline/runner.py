@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -30,6 +30,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import exclusive_lock
 from cleargs.pipeline.plan import (
+    NO_RESULTS,
     Planner,
     StageKey,
     StagePlan,
@@ -66,16 +67,10 @@ class Runner:
     def run_until(
         self, until: str | None = None, *, force: Sequence[str] = (), allow_partial: bool = False
     ) -> list[StageOutcome]:
-        """Find or make the results of each stage, and link them into the run folder.
+        """Find or make the results of each stage up to ``until``, and link them into the run folder.
 
-        Args:
-            until: The last stage; None for all stages.
-            force: Stages to run even if their results are in the store.
-            allow_partial: Continue after a stage that is done only in part. Otherwise, the run stops there
-                and the last outcome lists what is missing.
-
-        Returns:
-            The outcome of each stage that was found or made, in order.
+        Stages in ``force`` run even if their results are in the store. The run stops after a stage that is
+        done only in part, unless ``allow_partial``; the last outcome lists what is missing.
 
         Raises:
             InputError: A model that a stage needs is missing. Nothing was started.
@@ -94,7 +89,8 @@ class Runner:
                 self.reporter.info(line)
         outcomes: list[StageOutcome] = []
         done: dict[str, Manifest] = {}
-        with self._lock_run(), self.store.in_use():
+        lock = exclusive_lock(self.run.folder / LOCK, self.reporter, self.run.folder.name)
+        with lock, self.store.in_use():
             check_same_input(self.run, self.dag, self.store)
             self._unlink_outdated()  # before run.toml changes: no results of other settings
             write_run_file(self.run)
@@ -110,10 +106,6 @@ class Runner:
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
         return outcomes
-
-    def _lock_run(self) -> AbstractContextManager[bool]:
-        """Hold the lock of the run folder; wait for another process that works in it."""
-        return exclusive_lock(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
     def _unlink_outdated(self) -> None:
         """Remove the links to results of other settings or inputs."""
@@ -140,16 +132,6 @@ class Runner:
         ]
         if line := cost_line(costs):
             self.reporter.info(f"new {line}")
-
-    def _find(self, name: str, stage_key: StageKey) -> Entry | None:
-        """Return the results for ``stage_key``. Damaged ones cause a warning and count as missing."""
-        entry = self.store.find(name, stage_key.key)
-        if entry is not None and entry.damage is not None:
-            self.reporter.warn(
-                f"{name}: the stored results are damaged ({entry.damage}); the stage runs again"
-            )
-            return None
-        return entry
 
     def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and link them into the run folder.
@@ -193,10 +175,16 @@ class Runner:
             entry = self.store.find(name, stage_key.key)
             reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
             with self.store.lock(stage_key.key, self.reporter, name) as locked:
-                entry = self._find(name, stage_key)
+                entry = self.store.find(name, stage_key.key)
+                if entry is not None and entry.damage is not None:
+                    self.reporter.warn(
+                        f"{name}: the stored results are damaged ({entry.damage}); the stage runs again"
+                    )
+                    entry = None
                 manifest = entry.complete if entry is not None and not forced else None
                 if manifest is None:  # otherwise another process made it in the meantime
-                    self.reporter.info(f"{name}: started ({'; '.join(reasons)})")
+                    because = "" if reasons == (NO_RESULTS,) else f" ({'; '.join(reasons)})"
+                    self.reporter.info(f"{name}: started{because}")
                     manifest, how = self._make(stage_key, entry, forced=forced, locked=locked), "made"
         manifest = self._with_inherited(manifest, stage_key.inherited)
         self.store.link(self.run.folder, name, stage_key.key)

@@ -41,14 +41,9 @@ def resolve_device(
 ) -> Device:
     """Return the device to use. Does not import torch, which would take seconds.
 
-    Args:
-        choice: The user's choice. ``auto`` uses a GPU that passed its self-test and is faster than the CPU.
-        say: Receives a message with the choice of ``auto`` and its reason.
-        kept: The device of an existing run, which ``auto`` keeps.
-        test: Let ``auto`` run the self-test of a GPU that was not tested yet.
-
-    Raises:
-        InputError: The chosen or kept device is a GPU that cannot be used.
+    ``auto`` keeps the device of an existing run (``kept``). Otherwise it uses a GPU that passed its self-test
+    and is faster than the CPU, and reports the reason to ``say``. With ``test``, it runs the self-test of a
+    GPU that was not tested yet. Raises InputError if the chosen or kept device is a GPU that cannot be used.
     """
     if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
@@ -114,20 +109,9 @@ def resolve_run(
 ) -> RunSpec:
     """Return the run of a capture, with everything that decides its results.
 
-    An existing run keeps its settings, store and device unless an argument gives others.
-
-    Args:
-        dag: The stages, whose models check the settings.
-        source: The capture.
-        folder: The run folder, which need not exist.
-        recipe: Recipe to start from instead of the settings of an existing run.
-        overrides: Settings as ``a.b=value``.
-        seed: Seed instead of that of the recipe or the run.
-        reset: Start from the recipe instead of the settings of an existing run.
-        store: Folder of the store instead of that of the run.
-        device: Device instead of that of the run, unless "auto".
-        test_gpu: Let "auto" run the self-test of a GPU that was not tested yet.
-        say: Receives messages about the device, and about settings that the run keeps.
+    An existing run keeps its settings, store and device unless an argument gives others. A ``recipe`` or
+    ``reset`` starts from the recipe instead. ``test_gpu`` lets the device "auto" run the self-test of a GPU.
+    ``say`` receives messages about the device, and about settings that the run keeps.
 
     Raises:
         InputError: ``source`` does not exist or is a run.

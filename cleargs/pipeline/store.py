@@ -186,14 +186,10 @@ class Store:
     ) -> WorkFolder:
         """Prepare the work folder of ``key``.
 
-        Args:
-            key: The key of the stage.
-            forced: A forced rebuild. It has a separate work folder, which resumes only from a forced attempt.
-            entry: Results in the store. Usable ones are copied to the outputs unless ``forced``, or unless
-                the work folder already has outputs.
-            leftovers: Glob patterns of the outputs to keep from a killed attempt; all others are deleted.
-            locked: This process holds the lock of ``key``. Otherwise it works in its own folder, which takes
-                over the common one if there is one.
+        A ``forced`` rebuild has a separate folder, and resumes only from a forced attempt. Otherwise, usable
+        results in ``entry`` are copied to the outputs, unless there are outputs already. Files of a killed
+        attempt stay only if they match ``leftovers``. Without the lock of the key, this process works in its
+        own folder, which takes over the common one if there is one.
         """
         work = WorkFolder(self.root / "work" / (f"{key}.forced" if forced else key))
         with disk_errors(work.folder):
@@ -213,13 +209,10 @@ class Store:
         return work
 
     def publish(self, work: WorkFolder, manifest: Manifest) -> Manifest:
-        """Move the outputs of ``work`` to their final folder, atomically and durably.
+        """Move the outputs of ``work`` to their final folder, atomically and durably. Return the manifest.
 
         Complete results with equal content that are already there are kept, and the outputs of ``work`` are
         dropped. Partial, damaged or different ones are replaced.
-
-        Returns:
-            The manifest of the results in the final folder.
         """
         final = self.folder(manifest.stage, manifest.key)
         with disk_errors(final):
@@ -301,18 +294,10 @@ class Store:
     # -- removing --------------------------------------------------------------------------------------
 
     def collect(self, stages: tuple[str, ...], *, checkpoints: bool, dry_run: bool) -> list[Garbage]:
-        """Remove finished results that no run links to, and the remains of deleted folders.
+        """Remove finished results that no run links to, and the remains of deleted folders. Return them.
 
-        Args:
-            stages: Names of all stages.
-            checkpoints: Also remove unfinished work and the cache of results per item.
-            dry_run: Remove nothing.
-
-        Returns:
-            The folders that are removed, or would be.
-
-        Raises:
-            StoreError: A process uses the store, or the file system cannot tell.
+        With ``checkpoints``, unfinished work and the cache of results per item are removed too. ``dry_run``
+        removes nothing. Raises StoreError if a process uses the store, or if the file system cannot tell.
         """
         with file_lock(self.root / "locks" / "store.lock", wait=False) as locked:
             if locked is False:

@@ -94,16 +94,10 @@ def require_free(output: Path, *, force: bool) -> None:
 def write_shots(
     output: Path, scene: Scene, shots: Sequence[Shot], task: Task, *, fps: float, codec: Codec, device: str
 ) -> None:
-    """Render shots and write them to ``output``, atomically. A folder of stills also gets ``cameras.json``.
+    """Render shots of one size and write them to ``output`` (see `kind_of`), atomically.
 
-    Args:
-        output: File or pattern; see `kind_of`.
-        scene: The scene to render.
-        shots: Shots of one size.
-        task: Receives one step per shot.
-        fps: Frames per second of a film.
-        codec: Codec of a film.
-        device: cpu or cuda.
+    A folder of stills also gets ``cameras.json``. ``task`` receives one step per shot. ``fps`` and ``codec``
+    are those of a film.
 
     Raises:
         InputError: There are several shots for one still, or the size does not fit the codec.

@@ -39,12 +39,7 @@ def smooth_path(
     that a rotation without translation takes time too. Positions and quaternions are filtered with a Gaussian
     along the path. The padding mirrors the path through its ends, so that the ends do not move.
 
-    Returns:
-        The world-to-camera matrices at equal steps, and for each the index of the nearest camera along the
-        path.
-
-    Raises:
-        InputError: The cameras do not move.
+    The second result is the index of the nearest camera. Raises InputError if the cameras do not move.
     """
     centres = np.stack([camera.centre for camera in cameras])
     quaternions = Rotation.from_matrix([camera.world_to_camera[:3, :3].T for camera in cameras]).as_quat()

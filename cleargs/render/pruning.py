@@ -71,17 +71,10 @@ def _parsed(rule: str, **counts: int) -> tuple[str, tuple[float, ...]]:
 def prune_scene(
     scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str, reporter: Reporter
 ) -> tuple[Scene, str]:
-    """Remove the Gaussians below a threshold.
+    """Remove the Gaussians below one of the ``thresholds`` of `parse_prune`.
 
-    Args:
-        scene: The scene of ``stage``.
-        thresholds: The result of `parse_prune`.
-        run: The run folder.
-        stage: The stage whose image formation applies when the PSNR of the training frames is measured.
-        reporter: Receives the progress.
-
-    Returns:
-        The smaller scene, and a message with the number of removed Gaussians and the PSNR before and after.
+    Returns the smaller scene, and a message with the number of removed Gaussians and the PSNR before and
+    after, measured on the training frames with the image formation of ``stage``.
     """
     ingest, folder = run / "ingest", run / stage
     allocation = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
@@ -135,12 +128,7 @@ def contributions(scene: Scene, cameras: Iterable[Camera], advance: Callable[[],
     The contribution is the sum over pixels of the blending weight (opacity times the transmittance in front).
     A pixel's colour is the sum of weight times colour, so this is the gradient of the sum of the picture with
     respect to the colour of the Gaussian. All colours are set to grey, because a colour that is clamped at 0
-    has no gradient.
-
-    Args:
-        scene: A scene with N Gaussians.
-        cameras: The cameras of the pictures.
-        advance: Called after each camera.
+    has no gradient. ``advance`` is called after each camera.
     """
     gaussians = scene.gaussians.detach()
     grey = Gaussians(**{**gaussians.tensors(), "sh": torch.zeros_like(gaussians.sh[:, :1])})

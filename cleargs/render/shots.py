@@ -118,16 +118,10 @@ def render_run(
 
 
 class CaptureShots:
-    """Creates shots from the frames with a pose in a prepared capture.
+    """Creates shots from the frames with a pose in the prepared capture ``ingest``.
 
-    Args:
-        ingest: Folder of the finished stage ``ingest``.
-        size: Width and height of the images in pixels (None: those of the frames).
-        even: Increase an odd width or height of the frames by one pixel.
-        side_by_side: Show the raw frame on the left of each render, where there is one.
-
-    Raises:
-        InputError: if no frame has a pose.
+    Images have the ``size`` (None: that of the frames, one pixel more where ``even`` needs it). The raw frame
+    is ``side_by_side`` with the render, where there is one. Raises InputError if no frame has a pose.
     """
 
     def __init__(self, ingest: Path, size: Size | None, *, even: bool, side_by_side: bool) -> None:
@@ -189,14 +183,9 @@ class CaptureShots:
 def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | None = None) -> list[Camera]:
     """Read the cameras of a ``cameras.json`` or ``transforms.json``, in normalised coordinates.
 
-    Args:
-        path: The file.
-        lens: Camera whose size and intrinsics replace missing ones. Distortion is ignored.
-        similarity: Transform from the coordinates of the input to normalised coordinates.
-        world: Coordinates of the file (default: normalised for cameras.json, input for transforms.json).
-
-    Raises:
-        InputError: The file has another form, or a pose is not a rotation and a translation.
+    ``lens`` has the size and intrinsics that the file lacks; distortion is ignored. ``similarity`` transforms
+    the coordinates of the input. ``world`` is that of the file (default: normalised for cameras.json, input
+    for transforms.json). Raises InputError if the file has another form, or a pose is not rigid.
     """
     try:
         document = read_json(path)

@@ -20,6 +20,7 @@ from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frame import from_row
 from cleargs.formation.frames import view_of
 from cleargs.formation.motion import pixel_paths
+from cleargs.formation.movement import read_movement, still_pixels
 from cleargs.formation.table import FORMATION
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_rgb, to_uint8
@@ -186,17 +187,9 @@ def last_scene(stages: Collection[str]) -> str | None:
 
 
 def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
-    """Read the data of all frames of a run.
+    """Return the data of all frames of a run, in the order of the capture, after the finished ``stages``.
 
-    Args:
-        run: The run folder.
-        stages: The finished stages.
-
-    Returns:
-        One row per frame, in the order of the capture.
-
-    Raises:
-        StoreError: if a table cannot be read.
+    Raises StoreError if a table cannot be read.
     """
     judged: dict[int, dict[str, Any]] = {}
     if "rva" in stages:
@@ -212,10 +205,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     moving: dict[int, MaskBool] = {}
     if final := last_scene(stages):
         if (path := run / final / "movement.parquet").is_file():
-            for row in read_any_table(path).to_pylist():
-                shape = row["rows"], row["columns"]
-                bits = np.unpackbits(np.frombuffer(row["moves"], np.uint8), count=shape[0] * shape[1])
-                moving[row["frame_id"]] = bits.reshape(shape) > 0
+            moving = read_movement(path)
         exposure = read_exposure(run / final / "exposure.parquet")
         if exposure.enabled:
             affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
@@ -278,7 +268,7 @@ IMAGE_BYTES = 8_500_000
 _BYTES_PER_PIXEL = 0.18  # in JPEG files at _QUALITY
 _SIDE_MAX, _SIDE_MIN = 960, 240  # limits of the long side of a layer, px
 _THUMBNAIL, _QUALITY = 240, 84  # long side, px; JPEG quality
-_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # of a drawn path and its border
+_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # border and colour of a drawn path
 _UNUSED = (214, 69, 48)  # colour of pixels that no training used, sRGB
 
 MAX_RENDERED = 40
@@ -313,18 +303,10 @@ def write_pictures(
     scene: TrainedScene | None,
     threads: int,
 ) -> dict[int, FramePictures]:
-    """Write the thumbnails and layers of all frames.
+    """Write the thumbnails and layers of all frames. Return frame_id -> image files.
 
-    Args:
-        rows: The frames.
-        run: The run folder.
-        report: Folder of the report.
-        final: Renderer of the last scene; None without one.
-        scene: The same scene with the formations of its frames; None without a model of any.
-        threads: Number of threads.
-
-    Returns:
-        frame_id -> image files.
+    ``final`` renders the last scene; None without one. ``scene`` is the same scene with the formations of its
+    frames; None without a model of any.
     """
     (report / FOLDER).mkdir(parents=True)
     placed = [row.frame.frame_id for row in rows if final and row.frame.registered]
@@ -346,13 +328,9 @@ def write_pictures(
 
 
 def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -> int:
-    """Return the long side, in pixels, with which all images fit into a limit.
+    """Return the long side (px) with which JPEG files of ``aspect`` (height / width) fit in a budget.
 
-    Args:
-        pictures: Number of images.
-        aspect: Height divided by width.
-        budget: Limit for the total size of the JPEG files, in bytes.
-        least: Minimum of the long side, even if the limit is then exceeded.
+    The ``budget`` is in bytes. The side is at least ``least``, even if the budget is then exceeded.
     """
     pixels = budget / (_BYTES_PER_PIXEL * max(pictures, 1))
     return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), least, _SIDE_MAX))
@@ -363,11 +341,7 @@ def formed_layers(
 ) -> dict[str, ImageU8]:
     """Return the layers of a frame that no EXR holds, computed from its formation; none without a model.
 
-    Args:
-        row: The frame.
-        run: The run folder.
-        scene: The last scene.
-        side: Longest side of the layers, px; None for the frame's.
+    ``scene`` is the last scene. ``side`` is the longest side of the layers, px; None for the frame's.
     """
     tried = row.selection is not None and row.selection.exr is not None
     if scene is None or tried or not row.modelled:
@@ -380,15 +354,13 @@ def formed_layers(
 def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     """Return layer -> image [H, W, 3] sRGB: the raw frame, and the other layers of its latest round.
 
-    Raises:
-        InputError: if an image cannot be read.
-        StoreError: if the file of the layers cannot be read.
+    Raises InputError if an image cannot be read, and StoreError for the file of the layers.
     """
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.moving is not None:
         height, width = images["observed"].shape[:2]
-        cells = cv2.resize(row.moving.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        tint = np.where(cells[..., None] > 0, _UNUSED, images["observed"]).astype(np.uint8)
+        still = still_pixels(row.moving, height, width)[..., None]
+        tint = np.where(still, images["observed"], _UNUSED).astype(np.uint8)
         images["moving"] = np.asarray(cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0), np.uint8)
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")
@@ -450,14 +422,7 @@ def with_paths(image: ImageU8, row: FrameRow) -> ImageU8:
 
 
 def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:
-    """Write a JPEG file whose long side has at most ``side`` pixels.
-
-    Args:
-        report: Folder of the report.
-        name: Path of the file relative to ``report``.
-        image: The image [H, W, 3], sRGB.
-        side: Maximum of the long side, in pixels.
-    """
+    """Write ``image`` [H, W, 3] sRGB to a JPEG file of the report, at most ``side`` px wide or high."""
     height, width = image.shape[:2]
     factor = min(1.0, side / max(height, width))
     if factor < 1.0:

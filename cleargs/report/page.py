@@ -62,13 +62,7 @@ _STILL = 960  # long side of the image that is shown until the 3D viewer has loa
 
 
 def write_page(folder: Path, template: str | Template, **values: Any) -> None:
-    """Write ``index.html`` from a template.
-
-    Args:
-        folder: Folder of the page.
-        template: A template, or the name of one of the report's templates.
-        values: Variables of the template. Their text is escaped.
-    """
+    """Write ``index.html`` from a template, or the name of one of the report's. The values are escaped."""
     html = page_environment().get_template(template).render(version=cleargs.__version__, **values)
     (folder / PAGE).write_bytes(html.encode())
 
@@ -97,18 +91,13 @@ def page_environment() -> Environment:
 
 
 def write_report(planner: Planner, last: LastRun | None = None) -> Path:
-    """Write the report of a run atomically, in place of an older one, and the page that leads to it.
+    """Write the report of a run atomically, in place of an older one. Return the path of its page.
 
-    Args:
-        planner: Planner of the run.
-        last: The work of the last ``cleargs run`` (default: as in the older report).
-
-    Returns:
-        The path of the page.
+    ``last`` is the work of the last ``cleargs run`` (default: as in the older report).
 
     Raises:
         InputError: if no stage of the run is finished.
-        StoreError: if a result cannot be read, or if the report cannot be written.
+        StoreError: if a result is damaged, or the report cannot be written.
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
@@ -173,18 +162,9 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             },
         )
         write_report_json(folder, manifests, last)
-    write_entry_page(run)
+    leads_to_it = page_environment().get_template("entry.html.jinja").render(name=run.name)
+    write_bytes(run / ENTRY, leads_to_it.encode())
     return page_of(run)
-
-
-def write_entry_page(run: Path) -> Path:
-    """Write ``RUN/report.html``, a small page that leads to the report, and return its path.
-
-    Raises StoreError if it cannot be written.
-    """
-    page = page_environment().get_template("entry.html.jinja").render(name=run.name)
-    write_bytes(run / ENTRY, page.encode())
-    return run / ENTRY
 
 
 def _write_scene(

@@ -32,16 +32,9 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'"
 
 
 class Server(ThreadingHTTPServer):
-    """The HTTP server of a run.
+    """The HTTP server of a run, at a host name or IP address and a port (0: any free port).
 
-    Args:
-        dag: The stages.
-        run: The run.
-        host: Name or IP address to listen at.
-        port: Port to listen at (0: any free port).
-
-    Raises:
-        InputError: if the address is not available.
+    Raises InputError if the address is not available.
     """
 
     daemon_threads = True

@@ -24,10 +24,8 @@ def single_file_size(folder: Path) -> int:
 def write_single_file(page: Path, target: Path) -> int:
     """Write the report at ``page`` as one HTML file, and return its size in bytes.
 
-    Images that the page shows at once replace their links. Others are in the object ``window.files``.
-
-    Raises:
-        StoreError: if the file cannot be written.
+    Images that the page shows at once replace their links. Others are in the object ``window.files``. Raises
+    StoreError if the file cannot be written.
     """
     folder = page.parent
     images = {

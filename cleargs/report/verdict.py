@@ -54,13 +54,7 @@ def figure_of(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
 
 
 def verdict(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> Verdict:
-    """Return the first lines of a report.
-
-    Args:
-        manifests: Stage -> manifest of the results that the report shows.
-        rows: The frames.
-        unseen: PSNR, dB, of each frame that was held out.
-    """
+    """Return the first lines of a report. ``unseen`` is the PSNR, dB, of each frame that was held out."""
     psnr, meaning = _headline_figure(manifests)
     text = _text(manifests, rows, unseen)
     if psnr is None:

@@ -47,15 +47,9 @@ def shown_degree(gaussians: int, sh_degree: int) -> int:
 
 
 def write_scene(path: Path, name: str, scene: Scene) -> int:
-    """Write a scene as a script, since a page that is opened from disk may load scripts but not other files.
+    """Write a scene as a script, which registers it as ``name``. Return the SH degree that was kept.
 
-    Args:
-        path: The script file.
-        name: Name of the scene in the page.
-        scene: The scene.
-
-    Returns:
-        The SH degree that was kept.
+    A page that is opened from disk may load scripts but not other files.
     """
     gaussians = scene.gaussians
     visible = torch.sigmoid(gaussians.logit_opacities) >= _INVISIBLE
@@ -106,16 +100,10 @@ def opening_frame(placed: Sequence[FrameRow]) -> FrameRow:
 def viewer_data(
     placed: Sequence[FrameRow], scene: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[int, float]]:
-    """Return the settings of the viewer (schema of SuperSplat Viewer, version 2).
+    """Return the settings of the viewer (schema of SuperSplat Viewer, version 2), and frame_id -> time in s.
 
-    The trajectory is an animation track whose keys are the poses of the frames.
-
-    Args:
-        placed: The frames with a pose.
-        scene: The data of the scene for the page.
-
-    Returns:
-        The settings, and frame_id -> time in the animation, in seconds.
+    The trajectory is an animation track whose keys are the poses of the ``placed`` frames. ``scene`` is the
+    data of the scene for the page.
     """
     poses = {row.frame.frame_id: viewer_pose(camera_of(row.frame)) for row in placed}
     times = {frame_id: index * _SECONDS_PER_FRAME for index, frame_id in enumerate(poses)}

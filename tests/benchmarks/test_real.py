@@ -109,7 +109,10 @@ def test_a_tiny_benchmark_is_resumed_and_names_what_is_missing(
     assert again.cells == [one.model_copy(update=_times(one, again)) for one in found.cells]
     assert trained == [path.stat().st_mtime_ns for path in sorted((out / ".store").rglob("scene.ply"))]
     assert showcase(tmp_path / "row.jpg", out, found)
-    assert read_rgb(tmp_path / "row.jpg").shape[1] == 4 * 480 + 3 * 4
+    row = read_rgb(tmp_path / "row.jpg")
+    assert row.shape[1] == 4 * 480 + 3 * 4
+    pictures = [row[30:, left : left + 480] for left in range(0, row.shape[1], 484)]
+    assert all(picture.std() > 20 for picture in pictures)  # an empty place has one colour
 
 
 def _times(cell: Cell, others: Comparison) -> dict[str, float]:

@@ -72,7 +72,7 @@ def test_run_twice(shell: Shell) -> None:
     assert code == 0
     assert out.startswith(f"results: {shell.bench.folder}/total\n") and "time: " in out
     assert f"next: cleargs show {shell.bench.folder}\n" in out
-    assert "estimate: about" in err and "square: started (no results yet)" in err
+    assert "estimate: about" in err and "square: started\n" in err
     code, out, err = shell.run()
     assert code == 0 and "reused: count, square, total\n" in out and err == ""
 
@@ -424,7 +424,7 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path) -> None:
     ]
     run = tmp_path / "my room"
     assert outcome_lines(outcomes, run, run / "report.html") == [
-        f"scene: {run}/scene.ply (22 of 24 frames placed, 7 strong, 11 repaired)",
+        f"scene: {run}/scene.ply (22 of 24 frames placed, 7 reliable, 11 repaired)",
         "quality: PSNR 23.6 dB (first scene 22.6) on pixels that no training saw; "
         "views off the camera path are worse",
         "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); reused: ingest, rva",

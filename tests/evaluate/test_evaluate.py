@@ -151,7 +151,7 @@ def test_worlds_of_sfm_are_aligned_by_cameras(tmp_path: Path) -> None:
 def test_equal_stems_of_other_views_are_noticed_and_helped(tmp_path: Path) -> None:
     scene, novel = make_scene(), [turned(camera, 3.0) for camera in cameras()[::-1]]
     run = write_run(tmp_path / "run", scene, cameras(), poses="sfm")
-    observed = write_reference(tmp_path / "observed", scene, cameras())
+    observed = write_reference(tmp_path / "frames", scene, cameras())
     folder = write_reference(tmp_path / "novel", scene, novel)
     with pytest.raises(InputError, match="too large") as caught:
         reference_of(run, folder, reporter=Remarks())

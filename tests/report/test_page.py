@@ -13,8 +13,6 @@ from types import SimpleNamespace
 from typing import Any, Literal, cast
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
@@ -23,6 +21,7 @@ from cleargs.cli.main import invoke
 from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
+from cleargs.formation.movement import write_movement
 from cleargs.manifest import Manifest, linked_manifest, write_manifest
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
@@ -292,8 +291,7 @@ def test_held_out_frames_have_a_psnr_too(tmp_path: Path) -> None:
 def test_what_moves_in_a_frame_is_a_layer(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     cells = np.arange(32) % 8 < 4  # the left half of 4 rows of 8 cells
-    moves = {"frame_id": [2], "rows": [4], "columns": [8], "moves": [np.packbits(cells).tobytes()]}
-    pq.write_table(pa.table(moves), run.folder / "consolidate/movement.parquet")
+    write_movement(run.folder / "consolidate/movement.parquet", {2: cells.reshape(4, 8)})
     row = load_rows(run.folder, linked_manifests(run.folder, run.dag.names))[2]
     layers = layers_of(row, run.folder)
     change = np.abs(layers["moving"].astype(int) - layers["observed"]).max(axis=2)

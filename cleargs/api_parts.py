@@ -1,0 +1,269 @@
+"""The Python API: scenes, trainings, and scores of images, without a run.
+
+Images are [H, W, 3] sRGB, uint8 or float32 in [0, 1]. ``threads`` is the number of threads (default: all
+usable cores).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cleargs.pipeline.config import check_document
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.session import usable_cores
+from cleargs.progress import LineReporter, Reporter, Say, log_reporter
+from cleargs.run_results import Prepared
+from cleargs.splat.budget import resolve_config
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from cleargs import G0Config
+    from cleargs.splat.camera import Camera
+    from cleargs.splat.config import TrainConfig
+    from cleargs.splat.formation import Formation
+    from cleargs.splat.scene import Scene
+    from cleargs.splat.trainer import Trained
+    from cleargs.splat.types import Render
+    from cleargs.splat.views import TrainingView
+    from cleargs.types import AnyImage, ImageF32
+
+Progress = Reporter | Say | None
+"""Receiver of progress and remarks: the logger ``cleargs`` (None), a function that receives lines, or a
+`cleargs.progress.Reporter`."""
+
+
+def initialise(
+    capture: Prepared,
+    views: Sequence[TrainingView] | None = None,
+    config: G0Config | None = None,
+    *,
+    seed: int = 0,
+) -> Scene:
+    """Return a scene to start a training from: one Gaussian per sparse point, and more between them.
+
+    ``views`` give the added Gaussians their depths and colours (default: all of ``capture``). In ``config``,
+    only ``sh_degree``, ``min_points``, ``budget``, ``quality``, ``antialias`` and ``background`` have an
+    effect.
+
+    Example:
+        capture = cg.open_prepared(cg.open_run("run")["ingest"])
+        scene = cg.initialise(capture, config=cg.G0Config(sh_degree=1))
+    """
+    from cleargs import G0Config
+    from cleargs.capture.tables import load_observations
+    from cleargs.splat.initialise import SparsePoints, starting_gaussians
+    from cleargs.splat.scene import BLACK, Scene
+
+    views = capture.views() if views is None else views
+    config = resolve_config(config or G0Config(), views)
+    points, observations = capture.points, load_observations(capture.folder)
+    frame_ids = [view.frame_id for view in views]
+    sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
+    gaussians = starting_gaussians(
+        sparse,
+        views,
+        at_least=config.min_points,
+        at_most=config.budget,
+        sh_degree=config.sh_degree,
+        seed=seed,
+    )
+    return Scene(gaussians, config.antialias, config.background or BLACK)
+
+
+def train(
+    scene: Scene,
+    views: Sequence[TrainingView],
+    config: TrainConfig | None = None,
+    *,
+    formation: Formation | None = None,
+    seed: int = 0,
+    checkpoint: str | Path | None = None,
+    device: str = "cpu",
+    progress: Progress = None,
+) -> Trained:
+    """Optimise a scene to match images of it.
+
+    On a CPU the result depends only on the arguments, not on the number of threads.
+
+    Args:
+        scene: The scene to start from. It is not changed.
+        views: Images with cameras and weights.
+        config: Settings of the training.
+        formation: Model of how a camera turns the sharp scene into an image. None compares the images with
+            the render itself. `cleargs.formation.capture.CaptureFormation` also fits motion blur, rolling
+            shutter and defocus.
+        seed: Seed of all randomness.
+        checkpoint: File from which an interrupted training resumes, with the same result.
+        device: cpu or cuda.
+        progress: Receiver of progress and remarks.
+
+    Returns:
+        An object with the trained ``scene`` and a table ``rows`` with one row per step.
+
+    Raises:
+        InputError: if no view has a weight above 0.
+
+    Example:
+        capture = cg.open_prepared(cg.open_run("run")["ingest"])
+        start = cg.initialise(capture)
+        trained = cg.train(start, capture.views(), cg.TrainConfig(steps=20))
+        print(trained.rows["loss"][-1])
+    """
+    from cleargs.splat.config import TrainConfig
+    from cleargs.splat.trainer import Trainer
+
+    config = config or TrainConfig()
+    with tempfile.TemporaryDirectory() as nowhere:
+        if checkpoint is None:  # the interval is longer than any training: no checkpoint is written
+            config = config.model_copy(update={"checkpoint_interval": 1_000_000})
+        trainer = Trainer(scene, views, config, seed=(seed,), formation=formation, device=device)
+        return trainer.run(
+            checkpoint=Path(nowhere) / "none" if checkpoint is None else Path(checkpoint),
+            reporter=reporter_of(progress),
+        )
+
+
+def render_view(scene: Scene, camera: Camera) -> Render:
+    """Render a scene. The result is differentiable by torch in the parameters of the Gaussians.
+
+    Returns:
+        ``image`` [H, W, 3] sRGB (may exceed 1), ``alpha`` [H, W], and ``depth`` [H, W]: the sum of weight
+        times camera z. Divide ``depth`` by ``alpha`` for the mean depth in world units.
+
+    Example:
+        run = cg.open_run("run")
+        camera = cg.open_prepared(run["ingest"]).cameras()[0]
+        image = cg.render_view(run.scene(), camera).image.detach().numpy()
+    """
+    from cleargs.splat.render import render
+
+    return render(scene.gaussians, camera, background=scene.background, antialias=scene.antialias)
+
+
+def save(scene: Scene, path: str | Path) -> None:
+    """Write a scene in the format that the file ending names: .ply, .compressed.ply, .sog, .spz, .glb, .usdc.
+
+    Raises:
+        InputError: for another ending.
+
+    Example:
+        cg.save(cg.open_run("run").scene(), "room.spz")
+    """
+    from cleargs.splat.formats import format_of, write_scene
+
+    write_scene(Path(path), scene, format_of(Path(path)))
+
+
+def load(path: str | Path) -> Scene:
+    """Read a PLY file with Gaussians, as ClearGS and the Inria code write it.
+
+    Raises:
+        StoreError: if the file cannot be read.
+
+    Example:
+        scene = cg.load("run/g0/scene.ply")
+        print(scene.gaussians.num)
+    """
+    from cleargs.splat.ply import read_ply
+
+    return read_ply(Path(path))
+
+
+def score_frames(
+    paths: Sequence[str | Path],
+    *,
+    evaluator: str = "statistics",
+    threads: int | None = None,
+    progress: Progress = None,
+) -> pa.Table:
+    """Rate the image quality of each frame of a video.
+
+    Args:
+        paths: Image files in the order in which they were filmed.
+        evaluator: Evaluator of the cues: statistics, qwen3-vl, or one of an installed package.
+        threads: Number of threads (default: all usable cores).
+        progress: Receiver of progress and remarks.
+
+    Returns:
+        A table with one row per file: ``path``, RVA's eleven cues, the reliability ``R`` and the risk of
+        degradation ``B``. All numbers are in [0, 1], or NaN for a frame that could not be scored.
+
+    Raises:
+        ConfigError: for an unknown evaluator.
+
+    Example:
+        from pathlib import Path
+
+        paths = sorted(Path("room/images").iterdir())
+        table = cg.score_frames(paths)
+        print(table.sort_by("R").select(["path", "R", "B"]).slice(0, 3))
+    """
+    import pyarrow as pa
+
+    from cleargs.rva.allocation import appearance_scores
+    from cleargs.rva.evaluator import EvaluatedFrame
+    from cleargs.rva.evaluators import make_evaluator
+    from cleargs.rva.tables import CUE_COLUMNS
+
+    config: Any = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
+    with tempfile.TemporaryDirectory() as cache:
+        views = [EvaluatedFrame(number, Path(path)) for number, path in enumerate(paths)]
+        cues = make_evaluator(config, cache=Path(cache)).evaluate(
+            views, threads=threads or usable_cores(), reporter=reporter_of(progress)
+        )
+    R, B = appearance_scores(cues, config)
+    columns = dict(zip(CUE_COLUMNS, cues.T, strict=True))
+    return pa.table({"path": [str(path) for path in paths], **columns, "R": R, "B": B})
+
+
+def score(image: AnyImage, *, scorer: str = "clarity-net", threads: int | None = None) -> float:
+    """Rate the quality of an image without a reference, from 0 to 100 (higher is better).
+
+    ``scorer`` is clarity-net, naturalness-stats, an installed model (``cleargs models list``) or an ONNX
+    file. Raises InputError if it is unknown, or if the image is smaller than 32 pixels.
+
+    Example:
+        import numpy as np
+
+        image = np.random.default_rng(0).random((64, 96, 3), np.float32)
+        print(cg.score(image))
+    """
+    from cleargs.models.scorer import load_scorer
+
+    return load_scorer(scorer).score(_floats(image), threads=threads or usable_cores())
+
+
+def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = None) -> ImageF32:
+    """Restore a degraded image with a neural network. Return float32 in [0, 1] of the same size.
+
+    ``expert`` is embedded, an installed model (``cleargs models list``) or an ONNX file. Raises InputError if
+    it is unknown.
+
+    Example:
+        import numpy as np
+
+        image = np.random.default_rng(0).random((64, 96, 3), np.float32)
+        print(cg.score(cg.restore(image)))
+    """
+    from cleargs.models.expert import load_expert
+
+    return load_expert(expert).restore(_floats(image), threads=threads or usable_cores())
+
+
+def reporter_of(progress: Progress) -> Reporter:
+    if progress is None:
+        return log_reporter()
+    if callable(progress):
+        return LineReporter(progress, lambda text: progress(f"warning: {text}"), progress)
+    return progress
+
+
+def _floats(image: AnyImage) -> ImageF32:
+    import numpy as np
+
+    floats = image.astype(np.float32)
+    return floats / np.float32(255) if image.dtype == np.uint8 else floats
