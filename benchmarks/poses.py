@@ -165,7 +165,7 @@ def _worker(
     pycolmap.set_random_seed(0)
     create_database(sfm._database, job)
     sfm._extract(sfm._database, job.names, sfm_worker._FIRST)
-    sfm._match(sfm._database, sfm._pairs(), sfm_worker._FIRST)
+    sfm._match(sfm._database, sfm._pairs())
     sfm._output.mkdir(exist_ok=True)
     return sfm
 

@@ -163,13 +163,10 @@ def self_test(
     command: Sequence[str] | None = None,
     limit_s: float = LIMIT_S,
 ) -> SelfTest:
-    """Run the self-test, and keep its result in the user's cache folder.
+    """Run the self-test at the `current_facts`, and keep its result in the user's cache folder.
 
-    Args:
-        facts: those of `current_facts`.
-        say: takes a remark before the test starts.
-        command: the child process; by default the module `SELF_TEST`.
-        limit_s: seconds after which the child is ended.
+    ``say`` takes a remark before the test starts. ``command`` is the child process, by default the module
+    `SELF_TEST`, which is ended after ``limit_s`` seconds.
     """
     say("testing the GPU (once per driver and version; it takes up to three minutes)")
     command = command or module_command(SELF_TEST)

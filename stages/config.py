@@ -77,10 +77,7 @@ class DistilConfig(Settings):
         """Return the settings of a training that continues from the first scene.
 
         The regularisation of opacities and scales is off: it serves to remove and relocate Gaussians.
-
-        Args:
-            g0: Settings of the first scene.
-            frames: Number of active frames.
+        ``frames`` is the number of active frames.
         """
         share = (1.0 - ROUNDS_END) / G0_END
         inherited = {name: getattr(g0, name) for name in TrainConfig.model_fields}

@@ -49,11 +49,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
     "g0": TRAINED,
-    "rivr": (
-        *TRAINED,
-        "selection.parquet",
-        *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1)),
-    ),
+    "rivr": (*TRAINED, "selection.parquet", *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1))),
 }
 OUTPUTS = (*TRAINED, "train.parquet", "repairs.parquet", "before_after.png")
 LEFTOVERS: tuple[str, ...] = ()
@@ -129,10 +125,6 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     write_repairs(context.out / "repairs.parquet", repairs)
 
     g0 = TrainedScene(context.inputs["g0"], context.device)
-    draft = context.settings["g0"].quality == "draft"
-    if draft:
-        reporter.info("consolidation: a draft is not consolidated; the scene is G0's, unchanged")
-        repairs, kept = [], set()
     start = TrainedScene(rivr, context.device) if repairs or kept else g0
     consolidated, trainings = start, []
     if repairs or kept:

@@ -103,14 +103,10 @@ class RivrConfig(Settings):
     )
 
     def distillation(self, g0: TrainConfig, round: int, done: int, steps: int, frames: int) -> TrainConfig:
-        """Return the settings of a training with its part of the schedule.
+        """Return the settings of a training of ``steps`` steps with its part of the schedule.
 
-        Args:
-            g0: Settings of the first scene.
-            round: Round, from 1.
-            done: Steps of the round before this training.
-            steps: Steps of this training.
-            frames: Active frames, from which the steps of a round follow where they are unset.
+        ``round`` counts from 1, and ``done`` steps of it are before this training. The steps of a round
+        follow from the number of active ``frames`` where they are unset.
         """
         whole = self.distil.applied_to(g0, frames)
         step = (whole.end - whole.begin) / (self.rounds * whole.length)
@@ -311,13 +307,7 @@ def _repair_and_distil(
         for place, group in enumerate(groups):
             label = f"round {number}" + (f", group {place + 1} of {len(groups)}" if len(groups) > 1 else "")
             found = run_round(
-                number,
-                group.targets,
-                current,
-                rules,
-                context.out,
-                reporter,
-                label=f"{label}: candidates",
+                number, group.targets, current, rules, context.out, reporter, label=f"{label}: candidates"
             )
             rows += found
             kept = kept_raw(rows)

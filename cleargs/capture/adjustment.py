@@ -45,13 +45,10 @@ class Adjuster:
     def __init__(
         self, database: Path, triangulate: Callable[[pycolmap.Reconstruction, Path], pycolmap.Reconstruction]
     ) -> None:
-        """Copy ``database`` without the tracks that are kept out.
+        """Copy ``database``, which stays as it is, without the tracks that are kept out.
 
-        ``floor`` is the `median_error` if each pair of frames has a separate geometry.
-
-        Args:
-            database: features and verified matches; it stays as it is.
-            triangulate: gives a model new points, from the matches in a database.
+        ``floor`` is the `median_error` if each pair of frames has a separate geometry. ``triangulate`` gives
+        a model new points, from the matches in a database.
         """
         self._cut = database.with_name(f"{database.stem}-cut.db")
         copy_without_features(database, self._cut, [])

@@ -126,8 +126,7 @@ class Pose:
     @property
     def centre(self) -> NDArray[np.float64]:
         """Camera centre in the world, [3]."""
-        centre: NDArray[np.float64] = -self.rotation.T @ self.translation
-        return centre
+        return np.asarray(-self.rotation.T @ self.translation)
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
@@ -188,8 +187,7 @@ class Similarity:
 
     def points(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 3]
         """Return points of the input's world in the normalised world."""
-        moved: NDArray[np.float64] = (xyz - self.origin) @ self.rotation.T / self.scale
-        return moved
+        return np.asarray((xyz - self.origin) @ self.rotation.T / self.scale)
 
     def pose(self, pose: Pose) -> Pose:
         """Return the same camera, world to camera, in the normalised world."""
@@ -214,17 +212,10 @@ class Similarity:
 
     @staticmethod
     def from_json(noted: Any, ingest: Path) -> Similarity:
-        """Return what `to_json` wrote into the manifest of the finished folder ``ingest``.
-
-        Raises:
-            InputError: the manifest has no such similarity.
-        """
+        """Return what `to_json` wrote into the manifest of ``ingest``. Raises InputError if it has none."""
         try:
-            return Similarity(
-                np.array(noted["rotation"], np.float64).T,
-                np.array(noted["translation"], np.float64),
-                float(noted["scale"]),
-            )
+            rotation, origin = (np.array(noted[name], np.float64) for name in ("rotation", "translation"))
+            return Similarity(rotation.T, origin, float(noted["scale"]))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{ingest} does not say how it was normalised", hint="run that stage with --force"
@@ -232,11 +223,7 @@ class Similarity:
 
 
 def normalise(poses: Sequence[Pose]) -> Similarity:
-    """Return the similarity that normalises the world of these cameras.
-
-    Raises:
-        InputError: all cameras are at one place.
-    """
+    """Return the similarity that normalises the world of cameras; InputError if all are at one place."""
     centres = np.stack([pose.centre for pose in poses])
     origin = centres[0] + (centres - centres[0]).mean(axis=0)
     scale = float(np.linalg.norm(centres - origin, axis=1).max())

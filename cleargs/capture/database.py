@@ -93,9 +93,13 @@ def remove_database(database: Path) -> None:
 def copy_without_features(database: Path, copy: Path, image_ids: Collection[int]) -> None:
     """Copy COLMAP's ``database`` without the features and matches of these images."""
     remove_database(copy)
+    copy_database(database, copy)
+    remove_features(copy, image_ids)
+
+
+def copy_database(database: Path, copy: Path) -> None:
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
         source.backup(target)
-    remove_features(copy, image_ids)
 
 
 def frames_with_few_features(database: Path, names: Collection[str], limit: float) -> dict[str, int]:

@@ -29,10 +29,7 @@ def image_folders(root: Path) -> list[Path]:
 
 
 def image_files(folder: Path, *, below: bool = False) -> list[Path]:
-    """Return the images in ``folder``, in any order, without hidden ones.
-
-    ``below`` includes those in its subfolders.
-    """
+    """Return the images in ``folder`` (``below``: in its subfolders too), unordered, without hidden ones."""
     return _files(folder, IMAGE_SUFFIXES, below=below)
 
 
@@ -87,8 +84,7 @@ def _spelling(name: str, by_stem: bool) -> str:
 def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str, ...]:
     """Return a note on the ``missing`` of ``total`` images in ``listing``, or nothing if all exist.
 
-    Raises:
-        InputError: more than half of the images are missing.
+    Raises InputError if more than half of the images are missing.
     """
     if not missing:
         return ()

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.database import is_sound, remove_database
+from cleargs.capture.database import copy_database, is_sound, remove_database
 
 _PAIRS_PER_BLOCK = 200
 """COLMAP indexes the features of a frame again in each block (a tenth of the time),
@@ -47,16 +47,13 @@ def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def loop_pairs(
-    descriptors: Sequence[NDArray[np.uint8]],  # each [K, 128]
-    candidates: int,
-    min_gap: int,
-    seed: int,
+    descriptors: Sequence[NDArray[np.uint8]], candidates: int, min_gap: int, seed: int
 ) -> list[tuple[int, int]]:
     """Return each frame paired with the ``candidates`` most similar frames at least ``min_gap`` away.
 
-    Similarity is that of VLAD signatures (Jégou et al. 2010): residuals to the nearest word, summed per word,
-    signed square root, normalised. Word coordinates are integers, so that all large sums are exact in any
-    order.
+    Each frame has descriptors [K, 128]. Similarity is that of VLAD signatures (Jégou et al. 2010): residuals
+    to the nearest word, summed per word, signed square root, normalised. Word coordinates are integers, so
+    that all large sums are exact in any order.
     """
     count = len(descriptors)
     if candidates == 0 or count <= min_gap or not any(len(rows) for rows in descriptors):
@@ -142,8 +139,7 @@ def _match_block(database: Path, seed: int, block: Sequence[str]) -> int:
     """Match pairs (lines of two names) in this process's copy of ``database``; return their number."""
     share = database.with_name(f"{database.stem}-share{os.getpid()}.db")
     if not share.exists():
-        with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(share)) as target:
-            source.backup(target)
+        copy_database(database, share)
     pycolmap.set_random_seed(seed)
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()

@@ -93,18 +93,16 @@ def write_model(folder: Path, model: SparseModel, rgb: NDArray[np.uint8]) -> Non
     folder.mkdir(parents=True, exist_ok=True)
     cameras = [struct.pack("<Q", len(model.cameras))]
     for camera_id, camera in sorted(model.cameras.items()):
-        cameras.append(
-            struct.pack("<iiQQ", camera_id, camera.colmap().model.value, camera.width, camera.height)
-        )
+        kind = camera.colmap().model.value
+        cameras.append(struct.pack("<iiQQ", camera_id, kind, camera.width, camera.height))
         cameras.append(struct.pack(f"<{len(camera.params)}d", *camera.params))
     write_bytes(folder / "cameras.bin", b"".join(cameras))
 
     tracks: dict[int, list[tuple[int, int]]] = {int(point_id): [] for point_id in model.point_ids}
     images = [struct.pack("<Q", len(model.images))]
     for image_id, image in sorted(model.images.items()):
-        images.append(
-            struct.pack("<i7di", image_id, *image.pose.quaternion, *image.pose.translation, image.camera_id)
-        )
+        pose = image.pose
+        images.append(struct.pack("<i7di", image_id, *pose.quaternion, *pose.translation, image.camera_id))
         images.append(image.name.encode() + b"\0" + struct.pack("<Q", len(image.xy)))
         points2d = np.empty(len(image.xy), _POINT2D)
         points2d["xy"], points2d["point_id"] = image.xy, image.point_ids
@@ -124,13 +122,9 @@ def write_model(folder: Path, model: SparseModel, rgb: NDArray[np.uint8]) -> Non
 
 
 def transform_model(
-    model: SparseModel,
-    *,
-    scale: float,
-    rotation: NDArray[np.float64],  # [3, 3]
-    translation: NDArray[np.float64],  # [3]
+    model: SparseModel, *, scale: float, rotation: NDArray[np.float64], translation: NDArray[np.float64]
 ) -> SparseModel:
-    """``model`` under x -> scale rotation x + translation."""
+    """``model`` under x -> scale rotation [3, 3] x + translation [3]."""
     return model.moved(Similarity(rotation, -rotation.T @ translation / scale, 1 / scale))
 
 

@@ -39,10 +39,8 @@ def still_parts(images: Sequence[Path]) -> NDArray[np.uint8] | None:
     """
     step = max(1, len(images) / _SAMPLES)
     chosen = [images[int(index * step)] for index in range(min(len(images), _SAMPLES))]
-    if len(chosen) < _FEWEST:
-        return None
     sizes = {image_size(path) for path in chosen}
-    if len(sizes) > 1:
+    if len(chosen) < _FEWEST or len(sizes) > 1:
         return None
     total, squares = np.zeros((2, *sizes.pop()[::-1]), np.float32)
     for path in chosen:

@@ -61,21 +61,17 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     images, masks = folder / "images", folder / "masks"
     make_folder(images)
     make_folder(masks)
-    names = [f"{index:06d}.png" for index in range(len(capture.frames))]
-    paths = [images / name for name in names]
-    with reporter.task("reading frames", len(names)) as task:
-        todo = {
-            path: frame
-            for path, frame in zip(paths, capture.frames, strict=True)
-            if not resumable(path, reporter)
-        }
-        task.update(done=len(names) - len(todo))
+    paths = [images / f"{index:06d}.png" for index in range(len(capture.frames))]
+    pairs = list(zip(capture.frames, paths, strict=True))
+    with reporter.task("reading frames", len(paths)) as task:
+        todo = {path: frame for frame, path in pairs if not resumable(path, reporter)}
+        task.update(done=len(paths) - len(todo))
         for path, rgb in _pictures(todo):
             write_rgb(path, reduced(rgb, long_side))
             task.advance()
-    first = list(zip(capture.frames, paths, strict=True))[:_PANORAMAS]
     if all(
-        (frame.pts is None and is_panorama(frame.path)) or wraps_around(read_rgb(p)) for frame, p in first
+        (frame.pts is None and is_panorama(frame.path)) or wraps_around(read_rgb(path))
+        for frame, path in pairs[:_PANORAMAS]
     ):
         raise InputError(
             "the pictures are equirectangular panoramas, which show all directions",
@@ -88,8 +84,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             "masked in all frames"
         )
     prepared = [
-        _work_frame(frame, path, masks / f"{path.name}.png", still, reporter)
-        for frame, path in zip(capture.frames, paths, strict=True)
+        _work_frame(frame, path, masks / f"{path.name}.png", still, reporter) for frame, path in pairs
     ]
     if any(made.masked for made in prepared):
         for made in prepared:  # COLMAP leaves out an image that has none where others have
@@ -122,8 +117,7 @@ def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
     width, height = reduced_size(image.shape[1], image.shape[0], long_side)
     if (height, width) == image.shape[:2]:
         return image
-    smaller: ImageU8 = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
-    return smaller
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
@@ -196,10 +190,7 @@ def _stencilled(
     coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
     if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
         what = "is far smaller than it" if coarse else "does not have its proportions"
-        raise InputError(
-            f"the mask of {frame.name} {what}",
-            hint="make masks of the size of their images",
-        )
+        raise InputError(f"the mask of {frame.name} {what}", hint="make masks of the size of their images")
     own = np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST))
     return np.minimum(mask, own)
 

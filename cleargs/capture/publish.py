@@ -61,7 +61,8 @@ def publish(
             flat.append(undistortion.pinhole)
             rgb = _write_picture(frame, undistortion, work, out, reporter)
             if frame.image in registered:
-                image = _flattened(registered[frame.image], undistortion)
+                xy = undistortion.points(registered[frame.image].xy)
+                image = replace(registered[frame.image], xy=xy).select(undistortion.inside(xy))
                 if index not in test:
                     rows = np.searchsorted(model.point_ids, image.point_ids)
                     x, y = image.xy.astype(np.int64).T
@@ -74,10 +75,8 @@ def publish(
     counts = np.bincount(np.searchsorted(model.point_ids, seen), minlength=len(model.point_ids))
     kept = (counts >= 2) & (samples >= 1)
     if not kept.any():
-        raise StageError(
-            "no sparse point is seen by two frames",
-            hint="record with more texture and overlap between frames",
-        )
+        hint = "record with more texture and overlap between frames"
+        raise StageError("no sparse point is seen by two frames", hint=hint)
     rgb_mean = np.rint(sums[kept] / samples[kept, None]).astype(np.uint8)
     cameras = {number: camera for camera, number in numbers.items()}
     published = replace(model, cameras=cameras, images=images).select(kept)
@@ -120,16 +119,9 @@ def _write_picture(
         rgb = undistortion.image(read_rgb(work / "images" / frame.image))
         write_rgb(target, rgb)
     if frame.masked:
-        write_mask(
-            out / "masks" / frame.image, undistortion.mask(read_mask(work / "masks" / f"{frame.image}.png"))
-        )
+        mask = read_mask(work / "masks" / f"{frame.image}.png")
+        write_mask(out / "masks" / frame.image, undistortion.mask(mask))
     return rgb
-
-
-def _flattened(image: ModelImage, undistortion: Undistorter) -> ModelImage:
-    """Return the observations in the published image, without those in the cropped margin."""
-    xy = undistortion.points(image.xy)
-    return replace(image, xy=xy).select(undistortion.inside(xy))
 
 
 def _write_points(

@@ -72,10 +72,8 @@ def reconstruct(
     """Return poses, cameras and points of the working images in ``folder``, in which COLMAP works too.
 
     Poses of the input are normalised in float64 before COLMAP uses them. The sparse model ``given`` with the
-    input replaces the triangulation if its poses fit the images.
-
-    Raises:
-        StageError: too few frames get a pose.
+    input replaces the triangulation if its poses fit the images. StageError is raised if too few frames get
+    a pose.
     """
     poses = {frame.image: frame.source.pose for frame in frames if frame.source.pose is not None}
     posed = [frame for frame in frames if frame.image in poses]

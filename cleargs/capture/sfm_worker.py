@@ -71,8 +71,6 @@ class _FeatureSettings:
     neighbours: bool = False
     """Placed frames within ``overlap`` of a frame that is left out get new features too: without them a
     dark or turning stretch breaks the chain."""
-    suffix: str = ""
-    """Added to the name of a step that is repeated."""
 
 
 _FIRST = _FeatureSettings("sfm")
@@ -81,10 +79,8 @@ _FEW, _FAINT = 0.25, 0.002
 """Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
 plain frames, through which a chain of frames loses its scale (docs/experiments/poses.md)."""
 _AGAIN = (
-    _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15, suffix=" again"),
-    _FeatureSettings(
-        "sfm with fainter features", neighbours=True, contrast=0.001, inliers=15, suffix=" again"
-    ),
+    _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),
+    _FeatureSettings("sfm with fainter features", neighbours=True, contrast=0.001, inliers=15),
 )
 """For frames that are left out. A blur of 24 px at 480 is half as long at half the size, and the contrast
 that it leaves is enough (docs/experiments/poses.md). Affine-shape features and guided matching of these
@@ -139,7 +135,7 @@ class _Sfm:
                 hint="the camera must move while it records; look whether the video froze",
             )
         pairs = self._pairs()
-        self._match(self._database, pairs, _FIRST)
+        self._match(self._database, pairs)
         make_folder(self._output, empty=True)
         if job.poses is not None:
             model, outcome = self._from_poses(job.poses, pairs)
@@ -242,7 +238,8 @@ class _Sfm:
         reader = pycolmap.ImageReaderOptions()
         if job.masks is not None:
             reader.mask_path = job.masks
-        self._report(phase=f"finding features{settings.suffix}", total=len(names))
+        again = "" if settings == _FIRST else " again"
+        self._report(phase=f"finding features{again}", total=len(names))
         size = 4 * job.threads
         for start in range(0, len(names), size):
             block = list(names[start : start + size])
@@ -259,10 +256,10 @@ class _Sfm:
                 )
             self._report(done=start + len(block))
 
-    def _match(self, database: Path, pairs: Sequence[tuple[int, int]], settings: _FeatureSettings) -> None:
+    def _match(self, database: Path, pairs: Sequence[tuple[int, int]], again: str = "") -> None:
         """Match and verify pairs of frames; pairs that were matched before are skipped."""
         job = self._job
-        self._report(phase=f"matching{settings.suffix}", total=len(pairs))
+        self._report(phase=f"matching{again}", total=len(pairs))
         match_pairs(database, job.names, pairs, job.seed, job.threads, lambda n: self._report(done=n))
 
     def _pairs(self) -> list[tuple[int, int]]:
@@ -329,7 +326,7 @@ class _Sfm:
             database = self._database.with_name(f"{settings.name.replace(' ', '-')}.db")
             copy_without_features(self._matched, database, [index + 1 for index in again])
             self._extract(database, [names[index] for index in sorted(again)], settings)
-            self._match(database, [pair for pair in pairs if not again.isdisjoint(pair)], settings)
+            self._match(database, [pair for pair in pairs if not again.isdisjoint(pair)], " again")
             self._report(phase="placing frames again", total=None)
             found = self._continued(model, database, again, settings)
             if _names_in(found) > placed.keys():

@@ -27,13 +27,7 @@ def layout_of(source: Path, config: CaptureConfig) -> Layout:
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """Return all files of ``source`` that ingest reads, by role: a file, a folder, or single files by name.
-
-    A missing input is reported by ingest.
-
-    Raises:
-        InputError: transforms.json cannot be read.
-    """
+    """See `Layout.externals`. Raises InputError if transforms.json cannot be read."""
     return layout_of(source, config).externals(source, config)
 
 

@@ -46,8 +46,7 @@ class Undistorter:
     def points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2]
         """Return positions in the published image of pixel positions in the lens's image."""
         rays = self._lens.colmap().cam_from_img(np.ascontiguousarray(xy))
-        moved: NDArray[np.float64] = np.asarray(rays) * self.pinhole.focal + np.array(self.pinhole.centre)
-        return moved
+        return np.asarray(np.asarray(rays) * self.pinhole.focal + np.array(self.pinhole.centre))
 
     def inside(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:  # [K, 2]
         """Return True for each position inside the published image."""
@@ -59,10 +58,8 @@ def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
     """Prepare the undistortion of a camera's images to a long side of at most ``max_size`` px.
 
     The pinhole keeps the lens's focal lengths. It shows the largest rectangle around the axis that the lens's
-    image covers wholly, as COLMAP's undistorter does without blank pixels.
-
-    Raises:
-        InputError: the distortion leaves no such rectangle.
+    image covers wholly, as COLMAP's undistorter does without blank pixels. InputError is raised if the
+    distortion leaves no such rectangle.
     """
     if lens.is_pinhole:
         flat = pinhole(lens.width, lens.height, *lens.focal, *lens.centre)
@@ -93,8 +90,7 @@ def _covered(lens: Intrinsics) -> tuple[float, float, float, float]:
 
     def edge(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         rays = lens.colmap().cam_from_img(np.stack([x, y], axis=1) * size)
-        finite = np.isfinite(rays).all(axis=1)
-        return np.asarray(rays[finite], np.float64)
+        return np.asarray(rays[np.isfinite(rays).all(axis=1)], np.float64)
 
     first = (edge(zero, t)[:, 0], edge(t, zero)[:, 1])
     last = (edge(one, t)[:, 0], edge(t, one)[:, 1])

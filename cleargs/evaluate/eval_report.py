@@ -164,11 +164,6 @@ class Report(Figures):
         return document
 
 
-def mean_values(images: Sequence[ImageResult], metrics: Sequence[str]) -> dict[str, float | None]:
-    """Return the mean of each metric over the images that have it; None if no image has it."""
-    return {metric: mean_of(image.values[metric] for image in images) for metric in metrics}
-
-
 def mean_of(values: Iterable[float | None]) -> float | None:
     """Return the mean of the values that are not None; None if all are."""
     present = [value for value in values if value is not None]

@@ -17,7 +17,7 @@ from cleargs.capture.folders import image_files
 from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_of, mean_values, split_hash
+from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_of, split_hash
 from cleargs.evaluate.metrics import (
     apply_affine,
     clipped_pixels,
@@ -108,13 +108,7 @@ def evaluate_images(
 ) -> Evaluation:
     """Measure the images in ``folder``, of any method, matched with the references by their stems.
 
-    Args:
-        folder: the rendered images.
-        reference: images to compare with.
-        options: metrics and adjustments.
-        threads: CPU threads; results do not depend on it.
-        reporter: shows progress.
-        save: folder for the evaluated images.
+    The other arguments are those of `evaluate_scene`.
 
     Raises:
         InputError: no stem matches, an image cannot be read, or has another size than its reference.
@@ -251,7 +245,7 @@ def _evaluate(
         poses=reference.poses,
         alignment=reference.alignment,
         options=options,
-        means=mean_values(images, options.metrics),
+        means={metric: mean_of(image.values[metric] for image in images) for metric in options.metrics},
         psnr_colour_aligned=mean_of(image.psnr_colour_aligned for image in images),
         psnr_white=mean_of(image.psnr_white for image in images),
         psnr_between=mean_of(image.psnr_between for image in images),

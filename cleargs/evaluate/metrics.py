@@ -1,6 +1,7 @@
 """Measures of an image against its reference: PSNR and SSIM in float64, learned metrics, regions, colours.
 
-Sums are exact or taken by numpy in a fixed order, so the figures do not depend on the thread count.
+Images and references are [H, W, 3], masks [H, W] (True counts). Sums are exact or taken by numpy in a fixed
+order, so the figures do not depend on the thread count.
 """
 
 from __future__ import annotations
@@ -37,11 +38,7 @@ FARTHEST = 0.99
 CLIPPED = 254
 
 
-def psnr(
-    image: ImageU8,  # [H, W, 3]
-    reference: ImageU8,  # [H, W, 3]
-    mask: MaskBool | None = None,  # [H, W] True = counts
-) -> float | None:
+def psnr(image: ImageU8, reference: ImageU8, mask: MaskBool | None = None) -> float | None:
     """Peak signal-to-noise ratio in dB; infinite for equal images, None when no pixel counts."""
     difference = image.astype(np.int64) - reference
     if mask is not None:
@@ -52,11 +49,7 @@ def psnr(
     return 10.0 * math.log10(255.0**2 * difference.size / total) if total else math.inf
 
 
-def ssim(
-    image: ImageU8,  # [H, W, 3]
-    reference: ImageU8,  # [H, W, 3]
-    mask: MaskBool | None = None,  # [H, W] True = counts
-) -> float | None:
+def ssim(image: ImageU8, reference: ImageU8, mask: MaskBool | None = None) -> float | None:
     """Mean structural similarity (Wang et al., 2004) over pixels and channels; 1 for equal images.
 
     Gaussian window of 11 x 11 pixels and sigma 1.5, data range 1, images mirrored at their border: the
@@ -96,12 +89,7 @@ class MetricSet:
     unavailable: Mapping[str, str]
     """Metric -> reason why it is unavailable."""
 
-    def measure(
-        self,
-        image: ImageU8,  # [H, W, 3]
-        reference: ImageU8,  # [H, W, 3]
-        mask: MaskBool | None,  # [H, W] True = counts
-    ) -> dict[str, float | None]:
+    def measure(self, image: ImageU8, reference: ImageU8, mask: MaskBool | None) -> dict[str, float | None]:
         """Return all metrics of an image; unavailable ones are None.
 
         For LPIPS, masked pixels are those of the reference. Scorers have no masks and use the whole image.
@@ -148,11 +136,9 @@ def _floats(image: ImageU8) -> ImageF32:
 
 
 def fit_affine(
-    image: NDArray[np.float64],  # [H, W, 3] sRGB in [0, 1]
-    reference: NDArray[np.float64],  # [H, W, 3]
-    mask: MaskBool | None,  # [H, W] True = counts
+    image: NDArray[np.float64], reference: NDArray[np.float64], mask: MaskBool | None
 ) -> NDArray[np.float64]:  # [3, 4]
-    """Matrix and offset of least squares over the pixels that count; the identity when none does."""
+    """Matrix and offset of least squares on sRGB in [0, 1]; the identity when no pixel counts."""
     x = image.reshape(-1, 3) if mask is None else image[mask]
     y = reference.reshape(-1, 3) if mask is None else reference[mask]
     identity = np.eye(3, 4)
@@ -162,24 +148,22 @@ def fit_affine(
     # einsum, not BLAS, whose order of summation depends on its threads.
     normal = np.einsum("ni,nj->ij", design, design) / len(x) + RIDGE * np.eye(4)
     right = np.einsum("ni,nj->ij", design, y) / len(x) + RIDGE * identity.T
-    affine: NDArray[np.float64] = np.linalg.solve(normal, right).T
-    return affine
+    return np.asarray(np.linalg.solve(normal, right).T)
 
 
 def apply_affine(image: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the image [H, W, 3] mapped by ``affine`` [3, 4] and clipped to [0, 1]."""
-    mapped: NDArray[np.float64] = np.einsum("hwj,ij->hwi", image, affine[:, :3]) + affine[:, 3]
-    return mapped.clip(0.0, 1.0)
+    return np.asarray(np.einsum("hwj,ij->hwi", image, affine[:, :3]) + affine[:, 3]).clip(0.0, 1.0)
 
 
 # -- regions: the far, and the clipped, where scenes fail that look well on average ----------------------
 
 
-def depth_of_points(
-    points: NDArray[np.float64],  # [P, 3] in the scene's world
-    camera: Camera,
-) -> float | None:
-    """Return the depth behind which the view has no sparse points; None if it sees fewer than `FEWEST`."""
+def depth_of_points(points: NDArray[np.float64], camera: Camera) -> float | None:
+    """Return the depth behind which the view has no sparse points; None if it sees fewer than `FEWEST`.
+
+    ``points`` [P, 3] are in the scene's world.
+    """
     x, y, depth = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
@@ -187,12 +171,11 @@ def depth_of_points(
     return float(np.quantile(depth[seen], FARTHEST)) if seen.sum() >= FEWEST else None
 
 
-def far_pixels(
-    depth: PlaneF32,  # [H, W] summed with the weights of blending
-    alpha: PlaneF32,  # [H, W]
-    farthest: float,
-) -> MaskBool:
-    """Return True for pixels that show something behind ``farthest``, or are more than half transparent."""
+def far_pixels(depth: PlaneF32, alpha: PlaneF32, farthest: float) -> MaskBool:
+    """Return True for pixels that show something behind ``farthest``, or are more than half transparent.
+
+    ``depth`` is summed with the weights of blending.
+    """
     return np.asarray((alpha < 0.5) | (depth > farthest * alpha))
 
 

@@ -202,11 +202,10 @@ def _run_pose(frame: Frame) -> Pose:
 # -- two worlds -------------------------------------------------------------------------------------------
 
 
-def align_cameras(
-    source: Sequence[Pose],  # cameras in the world to leave
-    target: Sequence[Pose],  # the same ones in the world to enter
-) -> tuple[Similarity, Alignment]:
+def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Similarity, Alignment]:
     """Return the similarity that fits cameras best by place and direction, and its residuals.
+
+    ``source`` are cameras in the world to leave, ``target`` the same ones in the world to enter.
 
     The centres of a handheld walk are near a line or a plane and fix only poorly the turn: half a degree may
     be left, which costs an image decibels. They only fix the size. Then each camera counts as four points:
@@ -221,10 +220,8 @@ def align_cameras(
     fit = umeyama(_with_axes(source, theirs, spread * scale), _with_axes(target, ours, spread))
     errors = np.linalg.norm(fit.points(theirs) - ours, axis=1)
     extent = float(np.linalg.norm(ours[:, None] - ours[None], axis=2).max())
-    angles = [
-        rotation_between(fit.pose(their).rotation, our.rotation)
-        for their, our in zip(source, target, strict=True)
-    ]
+    pairs = zip(source, target, strict=True)
+    angles = [rotation_between(fit.pose(their).rotation, our.rotation) for their, our in pairs]
     return fit, Alignment(
         world="umeyama",
         matched=len(source),
@@ -240,11 +237,10 @@ def _with_axes(
     return np.concatenate([centres, (centres[:, None] + length * axes).reshape(-1, 3)])
 
 
-def umeyama(
-    source: NDArray[np.float64],  # [N, 3] centres in the world to leave
-    target: NDArray[np.float64],  # [N, 3] the same cameras' centres in the world to enter
-) -> Similarity:
+def umeyama(source: NDArray[np.float64], target: NDArray[np.float64]) -> Similarity:
     """Return the least-squares similarity from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
+
+    Both are the centres [N, 3] of the same cameras.
 
     Raises:
         InputError: fewer than three centres, or centres on one line.
@@ -257,10 +253,8 @@ def umeyama(
     for places, centred in ((source, a), (target, b)):
         spread = np.linalg.svd(centred, compute_uv=False)
         if spread[0] <= _ROUNDING * np.abs(places).max() or spread[1] <= _FLAT * spread[0]:
-            raise InputError(
-                "the matched cameras are at one place or on one line, which fixes no turn about it",
-                hint=hint,
-            )
+            what = "the matched cameras are at one place or on one line, which fixes no turn about it"
+            raise InputError(what, hint=hint)
     u, stretch, vt = np.linalg.svd(np.einsum("ni,nj->ij", b, a) / len(a))
     mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * mirror) @ vt

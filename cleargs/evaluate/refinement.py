@@ -37,19 +37,15 @@ def refine_pose(
     mask: MaskBool | None,  # [H, W] True = counts
     steps: int,
 ) -> tuple[Camera, Refinement]:
-    """Return the camera with the pose that lowers the mean squared difference, after ``steps`` steps.
+    """Return ``camera`` with the pose that lowers the mean squared difference, after ``steps`` steps.
+
+    Half of the steps are at full size.
 
     A pose is taken only where the difference at full size falls: a pose that fits reduced, blurred images
     better may be worse there.
 
-    Args:
-        render: renders the scene at a camera.
-        camera: the camera to start from.
-        distance: typical distance of the scene. It makes a unit of movement shift the image as much as a unit
-            of turning does.
-        reference: the image that the scene should explain.
-        mask: pixels that count.
-        steps: steps in all, half of them at full size.
+    ``distance`` is a typical distance of the scene. It makes a unit of movement shift the image as much as a
+    unit of turning does.
     """
     fine = max(1, round(_FINE * steps))
     small = camera.scaled(min(1.0, LONG_SIDE / max(camera.width, camera.height)))

@@ -92,8 +92,8 @@ class CaptureFormation:
             config: Settings.
             exposure: Colour affines to begin with; None for a training without any.
             lr_exposure: Learning rate of the affines.
-            known: Formations that an earlier training has found, by frame_id.
-            moving: Cells that move, by frame_id, from an earlier training.
+            known: Formations from an earlier training, by frame_id.
+            moving: Cells that move, likewise.
             draft: Search frames only where the test finds blur, also at the first look.
         """
         weighted = [view for view in views if view.weight > 0.0]

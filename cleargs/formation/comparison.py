@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from cleargs.formation.motion import BEND, FrameMotion, Model, flow_basis, widened
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
-from cleargs.splat.backend import SearchKernels
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
@@ -106,15 +105,8 @@ def scales(pair: FramePair) -> list[float]:
 class Level:
     """The problem at one size."""
 
-    def __init__(self, pair: FramePair, scale: float, kernels: SearchKernels = cpu) -> None:
-        """Reduce both images.
-
-        Args:
-            pair: The frame and the render.
-            scale: Size of this level over that of the frame.
-            kernels: Back end that computes misfits and normal equations.
-        """
-        self._kernels = kernels
+    def __init__(self, pair: FramePair, scale: float) -> None:
+        """Reduce both images to ``scale`` times the size of the frame."""
         margin = pair.margin
         height, width = pair.luminance.shape
         size = max(2, round(scale * width)), max(2, round(scale * height))
@@ -168,7 +160,7 @@ class Level:
     def _still(self) -> float:
         """Misfit without any motion."""
         fields = self._nowhere, self._nowhere, self._nowhere[0], None
-        total = self._kernels.misfit(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
+        total = cpu.misfit(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
         return total / self._total
 
     def evaluate(self, model: Model, motion: FrameMotion) -> MotionFit:
@@ -185,7 +177,7 @@ class Level:
 
     def _misfit(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
         fields = self.fields(motion, curved=motion.order > 1)
-        return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
+        return cpu.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
     def fields(
         self, motion: FrameMotion, curved: bool
@@ -212,7 +204,7 @@ class Level:
         """Return matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
         curved = bool((active >= BEND.start).any()) or motion.order > 1
         offset, sweep, _, curve = self.fields(motion, curved)
-        return self._kernels.normal_equations(
+        return cpu.normal_equations(
             self._stack,
             self._observed,
             self._fitting,

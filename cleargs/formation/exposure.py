@@ -139,13 +139,7 @@ class AffineOptimiser:
     """Adam on the affines. Only the frame just seen moves, and the weighted median stays the identity."""
 
     def __init__(self, exposure: Exposure, weights: NDArray[np.float64], rate: float) -> None:
-        """Begin at ``exposure``.
-
-        Args:
-            exposure: Affines of all frames.
-            weights: Weights of the frames in the median, [F].
-            rate: Learning rate.
-        """
+        """Begin at ``exposure`` of all frames, which have ``weights`` [F] in the median."""
         self.frame_ids = exposure.frame_ids
         self.affines = centred(exposure.affines, weights)
         self.first = np.zeros_like(self.affines)

@@ -18,7 +18,6 @@ from cleargs.formation.motion import MODELS, TWISTS, FrameMotion, Model, widened
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
 from cleargs.formation.search import blur_along, preferred, refine, search
 from cleargs.formation.warp import Warp, displacement_fields, path_lengths
-from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
@@ -124,9 +123,8 @@ def fit_motion(
     margin = margin_for(frame.reach_px * factor, camera)
     rendered = render(widened(camera, margin))
     pair = frame_pair(rendered, affine, target, mask, camera, margin)
-    kernels = backend_for(rendered.image.device)
     known = _scaled(frame.motion, factor)
-    found = refine(pair, frame.model, known, pose=pose, curve=again, kernels=kernels)
+    found = refine(pair, frame.model, known, pose=pose, curve=again)
     followed = preferred(found[1:] or found)
     best = _accepted(followed, found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
@@ -146,12 +144,11 @@ def fit_motion(
             skew=skews,
             defocus=skews or whole.disc_gain > whole.line_gain,
             pose=pose,
-            kernels=kernels,
         )
         if skews:
             frame = replace(frame, skew_gain=_skew_gain(found))
         if followed.model != "none":
-            found += refine(pair, followed.model, followed.motion, pose=pose, kernels=kernels)[1:]
+            found += refine(pair, followed.model, followed.motion, pose=pose)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
         best = _accepted(best, found[0], frame.model, config)
     return _described(frame, best, factor, camera, rendered, margin)

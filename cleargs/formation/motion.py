@@ -33,8 +33,7 @@ def _still() -> ArrayF64:
 class FrameMotion:
     """Motion and focus of the camera while it took a frame.
 
-    Twists [6] give the motion of the scene past the camera, in camera axes; the camera
-    moved the other way.
+    Twists [6] give the motion of the scene past the camera, in camera axes; the camera moved the other way.
     They are in pixels: a rotation by angle a is fx * a, a translation by d is fx * d / median depth.
 
     At time t of a row's exposure, from -1/2 to 1/2, the scene has moved by
@@ -49,9 +48,7 @@ class FrameMotion:
     pose: ArrayF64 = field(default_factory=_still)
     """From the frame's pose as given to the mean pose of its exposure."""
     bend: ArrayF64 = field(default_factory=_still)
-    """Factor of t^2 - 1/12 in the path at time t of the exposure, from -1/2 to 1/2."""
     cube: ArrayF64 = field(default_factory=_still)
-    """Factor of t^3 - 3t/20."""
     disc_px: float = 0.0
     """Radius of the disc of defocus, pixels per unit of nearness beyond the focus."""
     focus: float = 1.0

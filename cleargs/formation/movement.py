@@ -42,7 +42,7 @@ MIN_OTHERS = 3
 """Fewest other frames that see a place where something can move."""
 NEAR_FRAMES, MAX_NEAR_SHARE = 8, 0.5
 """Number of the other frames with the nearest cameras, and the largest share of them in which the same place
-may move. Where it moves in more of them, something that does not move has been left out by mistake: the masks
+may move. If it moves in more of them, something that does not move has been left out by mistake: the masks
 keep it from being learned, and then it differs."""
 MIN_CELLS = 6
 """Fewest cells of a region that moves."""
@@ -73,10 +73,7 @@ class Movement:
     """
 
     def __init__(
-        self,
-        cameras: Mapping[int, Camera],
-        tolerance: float,
-        known: Mapping[int, MaskBool] | None = None,
+        self, cameras: Mapping[int, Camera], tolerance: float, known: Mapping[int, MaskBool] | None = None
     ) -> None:
         self._tolerance = tolerance
         self._place = {frame_id: k for k, frame_id in enumerate(cameras)}
@@ -107,21 +104,12 @@ class Movement:
         self,
         frame_id: int,
         image: Tensor,  # [H, W, 3] sRGB, the render as the frame's camera saw it
-        render: Render,
-        margin: int,
+        render: Render,  # sharp, with depth
+        margin: int,  # pixels by which ``render`` is larger on every side
         target: Tensor,  # [H, W, 3] sRGB
-        mask: Tensor | None,  # [H, W]
+        mask: Tensor | None,  # [H, W] pixels that count by the user's mask
     ) -> None:
-        """Compare a frame with the scene, and find again what moves in it.
-
-        Args:
-            frame_id: The frame.
-            image: The scene as the frame's camera saw it.
-            render: The sharp render with depth.
-            margin: Pixels by which ``render`` is larger on every side.
-            target: The frame.
-            mask: Pixels that count by the user's mask, or None.
-        """
+        """Compare a frame, ``target``, with the scene, and find again what moves in it."""
         k, (height, width) = self._place[frame_id], image.shape[:2]
         assert render.depth is not None
         inner = slice(margin, margin + height), slice(margin, margin + width)
@@ -174,18 +162,11 @@ class Movement:
     def _elsewhere(
         self, k: int, row: NDArray[np.intp], column: NDArray[np.intp], depth: ArrayF32
     ) -> tuple[ArrayF32, NDArray[np.int64], ArrayF64]:
-        """Return what the other frames say of the places that cells of a frame show.
+        """Return what the other frames say of the places that C cells of frame ``k`` show at ``depth``.
 
-        Args:
-            k: Index of the frame.
-            row: Rows of the cells [C].
-            column: Columns of the cells [C].
-            depth: Camera z of the places [C].
-
-        Returns:
-            The median [C] of their differences, infinite where no other frame sees the place; the number of
-            frames [C] that see it and have been looked at; and the share [C] of the `NEAR_FRAMES` of these
-            with the nearest cameras, in which it moves.
+        These are the median [C] of their differences, infinite where no other frame sees the place; the
+        number of frames [C] that see it and have been looked at; and the share [C] of the `NEAR_FRAMES` of
+        these with the nearest cameras, in which it moves.
         """
         rows, columns = self._moves.shape[1:]
         fx, fy, cx, cy = self._lenses[k]

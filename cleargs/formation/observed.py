@@ -105,17 +105,10 @@ def render_observed(
     *,
     engine: Rasteriser | None = None,
 ) -> Tensor:
-    """Render ``scene`` as the camera of a view records it.
+    """Render ``scene`` as the camera of a view records it: [H, W, 3] sRGB in [0, 1], in new memory.
 
-    Args:
-        scene: The scene.
-        view: Its camera is used.
-        exposure: Colour affines; None leaves the colours as they are.
-        formation: Motion and defocus of the frame; None for a sharp render.
-        engine: Rasteriser of the scene's device.
-
-    Returns:
-        [H, W, 3] sRGB in [0, 1], in new memory.
+    Without ``exposure`` the colours stay as they are. Without ``formation`` the render is sharp. ``engine``
+    is a rasteriser of the scene's device.
     """
     engine = engine or rasteriser_for(str(scene.gaussians.device))
     affine = None if exposure is None else torch.from_numpy(exposure.of(view.frame_id).astype(np.float32))

@@ -12,18 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.comparison import (
-    COARSE,
-    DISC,
-    LEVELS,
-    FramePair,
-    Level,
-    MotionFit,
-    scales,
-)
+from cleargs.formation.comparison import COARSE, DISC, LEVELS, FramePair, Level, MotionFit, scales
 from cleargs.formation.motion import BEND, BLUR, CUBE, POSE, SKEW, TWIST, TWISTS, FrameMotion, Model
-from cleargs.splat.backend import SearchKernels
-from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.types import ArrayF64
 
 WARM_STEPS = 2
@@ -67,7 +57,6 @@ def search(
     skew: bool = True,
     defocus: bool = True,
     pose: bool = False,
-    kernels: SearchKernels = cpu,
 ) -> list[MotionFit]:
     """Fit every model from scratch.
 
@@ -77,12 +66,11 @@ def search(
         skew: Try models with a rolling shutter, which doubles the time.
         defocus: Try a disc of defocus, which doubles the time.
         pose: Correct the pose together with each motion.
-        kernels: Back end that computes misfits and normal equations.
 
     Returns:
         The fit of ``none`` first, then one of each model, those with a blur by the order of the path.
     """
-    levels = [Level(pair, scale, kernels) for scale in scales(pair)]
+    levels = [Level(pair, scale) for scale in scales(pair)]
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
@@ -107,28 +95,16 @@ def search(
 
 
 def refine(
-    pair: FramePair,
-    model: Model,
-    motion: FrameMotion,
-    *,
-    pose: bool = False,
-    curve: bool = False,
-    kernels: SearchKernels = cpu,
+    pair: FramePair, model: Model, motion: FrameMotion, *, pose: bool = False, curve: bool = False
 ) -> list[MotionFit]:
     """Fit ``model`` again from the numbers of the last fit, at the finest level.
 
-    Args:
-        pair: The frame and the render.
-        model: The model.
-        motion: The last fit.
-        pose: Correct the pose, too.
-        curve: Try the next order of the path, too.
-        kernels: Back end that computes misfits and normal equations.
+    The pose is corrected with ``pose``, and the next order of the path is tried with ``curve``.
 
     Returns:
         The fit of ``none`` first, then that of ``model`` where it is another, then that of the next order.
     """
-    level = Level(pair, scales(pair)[-1], kernels)
+    level = Level(pair, scales(pair)[-1])
     if model == "none":
         return [level.evaluate("none", FrameMotion())]
     still = FrameMotion(median_depth=level.median)
@@ -258,12 +234,7 @@ def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps
 
 
 def blur_along(length: float, angle: float) -> FrameMotion:
-    """Return a straight blur along a direction of the image, by turns of the camera.
-
-    Args:
-        length: Length of the pixels' paths, px.
-        angle: Direction from the x axis towards the y axis, radians.
-    """
+    """Return a straight blur of ``length`` px by turns of the camera; ``angle`` is from x towards y."""
     return FrameMotion(blur=_rotation(length, math.pi - angle))
 
 

@@ -9,27 +9,21 @@ import pyarrow as pa
 
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import AXES, FrameFormation, as_row, from_row
+from cleargs.formation.motion import TWISTS
 from cleargs.parquet import column, read_table, write_table
 
 _TWISTS = {
-    "pose": "of the scene past the camera from the pose as given to the mean pose of the exposure",
-    "blur": "of the scene past the camera from the start to the end of a row's exposure, linear in time",
-    "skew": "of the scene past the camera from the first to the last row's exposure",
-    "bend": "of the scene past the camera, times t^2 - 1/12 at time t of the exposure, -1/2 to 1/2",
-    "cube": "of the scene past the camera, times t^3 - 3t/20 at time t of the exposure, -1/2 to 1/2",
+    "pose": " from the pose as given to the mean pose of the exposure",
+    "blur": " from the start to the end of a row's exposure, linear in time",
+    "skew": " from the first to the last row's exposure",
+    "bend": ", times t^2 - 1/12 at time t of the exposure, -1/2 to 1/2",
+    "cube": ", times t^3 - 3t/20 at time t of the exposure, -1/2 to 1/2",
 }
 
 
-def _twist(name: str) -> list[pa.Field]:
-    return [
-        column(
-            f"{name}_{axis}",
-            pa.float64(),
-            f"{axis} {_TWISTS[name]}, px: t times fx / median depth, r times fx",
-            nullable=name in ("bend", "cube"),
-        )
-        for axis in AXES
-    ]
+def _component(name: str, axis: str) -> pa.Field:
+    text = f"{axis} of the scene past the camera{_TWISTS[name]}, px: t times fx / median depth, r times fx"
+    return column(f"{name}_{axis}", pa.float64(), text, nullable=name in ("bend", "cube"))
 
 
 FORMATION = pa.schema(
@@ -55,11 +49,7 @@ FORMATION = pa.schema(
         ),
         column("weight_before", pa.float64(), "RVA's weight of the frame"),
         column("weight_after", pa.float64(), "with which it taught at the end"),
-        *_twist("pose"),
-        *_twist("blur"),
-        *_twist("skew"),
-        *_twist("bend"),
-        *_twist("cube"),
+        *(_component(name, axis) for name in TWISTS for axis in AXES),
         column(
             "disc_px", pa.float64(), "radius of the disc of defocus per unit of nearness beyond the focus, px"
         ),

@@ -95,16 +95,10 @@ def samples(count: int) -> ArrayF32:
 def displacement_fields(
     motion: FrameMotion, camera: Camera, depth: Tensor, alpha: Tensor, margin: int = 0, scale: float = 1.0
 ) -> DisplacementFields:
-    """Return the displacement fields of a frame.
+    """Return the displacement fields of a frame with ``camera``.
 
-    Args:
-        motion: The frame's motion and focus.
-        camera: Camera of the photograph.
-        depth: Accumulated depth of the render at the photograph's pose, larger than the photograph by
-            ``margin`` pixels on every side.
-        alpha: Accumulated opacity, likewise.
-        margin: Width of the margin, px.
-        scale: Size of this photograph over that of the photograph in whose pixels ``motion`` is.
+    Accumulated depth and alpha are of a render at the frame's pose, larger than the frame by ``margin``
+    pixels on every side. The frame is ``scale`` times as large as that in whose pixels ``motion`` is.
     """
     numbers = np.empty(layout.MOTION_COLUMNS, np.float32)
     numbers[[layout.FX, layout.FY, layout.CX, layout.CY]] = camera.fx, camera.fy, camera.cx, camera.cy

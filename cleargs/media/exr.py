@@ -52,10 +52,8 @@ def from_layer(layer: Layer) -> ImageF32:
 def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> None:
     """Write the layers (all of one size) and attributes to ``path``, atomically.
 
-    The layer ``shown`` is also written as the plain channels R, G, B.
-
-    Raises:
-        StoreError: the disk is full or not writable.
+    The layer ``shown`` is also written as the plain channels R, G, B. Raises StoreError if the disk is full
+    or not writable.
     """
     layers = {f"{name}.": layer for name, layer in image.layers.items()}
     if shown is not None:
@@ -64,16 +62,10 @@ def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> N
     _write(path, np.concatenate(list(layers.values()), axis=2), channels, image.attributes)
 
 
-def write_view(
-    path: Path,
-    image: ImageF32,
-    alpha: PlaneF32,  # [H, W]
-    depth: PlaneF32,  # [H, W] along the optical axis
-) -> None:
+def write_view(path: Path, image: ImageF32, alpha: PlaneF32, depth: PlaneF32) -> None:
     """Write one image over black as the channels R, G, B, A (half) and Z (float), atomically.
 
-    Raises:
-        StoreError: the disk is full or not writable.
+    ``depth`` is along the optical axis. Raises StoreError if the disk is full or not writable.
     """
     layer = to_layer(image).astype(np.float32)
     _write(path, np.dstack([layer, alpha, depth]), dict.fromkeys("RGBA", HALF) | {"Z": FLOAT}, {})

@@ -75,11 +75,8 @@ def image_size(path: Path) -> tuple[int, int]:
 def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
     """Return the image in ``path`` as 8-bit sRGB [H, W, 3].
 
-    Alpha is dropped, 16 bits are reduced to 8, and an ICC profile is converted to sRGB.
-
-    Args:
-        path: the image file.
-        upright: turn it by its EXIF orientation.
+    Alpha is dropped, 16 bits are reduced to 8, and an ICC profile is converted to sRGB. With ``upright``, the
+    image is turned by its EXIF orientation.
 
     Raises:
         InputError: there is no readable image, or it has more than `MAX_PIXELS`.
@@ -115,19 +112,13 @@ def read_alpha(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
     return None if opaque.all() else np.asarray(np.where(opaque, 255, 0), np.uint8)
 
 
-def write_rgb(
-    path: Path,
-    image: AnyImage,  # [H, W, 3]
-    *,
-    quality: int | None = None,
-) -> None:
-    """Write an RGB image atomically in the format of its ending. Floats are sRGB, clipped to [0, 1].
+def write_rgb(path: Path, image: AnyImage, *, quality: int | None = None) -> None:
+    """Write an image [H, W, 3] atomically in the format of its ending. Floats are sRGB, clipped to [0, 1].
 
     ``quality`` is that of a JPEG. Raises StoreError when the disk is full or not writable.
     """
-    rgb = to_uint8(image)
     options = [] if quality is None else [cv2.IMWRITE_JPEG_QUALITY, quality]
-    _, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    _, data = cv2.imencode(path.suffix, cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2BGR), options)
     write_bytes(path, data.tobytes())
 
 

@@ -72,8 +72,7 @@ class Timeline:
 def read_timeline(path: Path) -> Timeline:
     """Read the time stamps of ``path`` without decoding it.
 
-    Raises:
-        InputError: it is not a video, is empty, or breaks off.
+    Raises InputError if it is not a video, is empty, or breaks off.
     """
     with _open(path) as (container, stream):
         pts: list[int] = []
@@ -109,8 +108,7 @@ def video_size(path: Path) -> tuple[int, int]:
 def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
     """Decode ``path`` once and yield (pts, RGB [H, W, 3]) of the wanted frames, one in memory at a time.
 
-    Raises:
-        InputError: a wanted frame cannot be decoded, or has too many pixels.
+    Raises InputError if a wanted frame cannot be decoded, or has too many pixels.
     """
     missing = set(pts)
     for number, frame, aspect in _decoded(path, pts):

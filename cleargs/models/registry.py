@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 from pydantic import Field
 
@@ -26,6 +26,18 @@ State = Literal["shipped", "installed", "not installed", "incomplete"]
 Converter = Literal["lpips", "spandrel", "musiq", "clip-iqa"]
 
 _SHA256 = r"^[0-9a-f]{64}$"
+
+
+class Network(Protocol):
+    """A model that works on images."""
+
+    @property
+    def name(self) -> str:
+        """Short name for tables."""
+
+    @property
+    def digest(self) -> str:
+        """Digest of the weights, part of the store key."""
 
 
 class Source(FrozenModel):
@@ -144,13 +156,9 @@ def registered(name: str, role: Role) -> RegistryEntry | None:
 def model_file(spec: str, role: Role) -> Path | None:
     """Return the absolute path of the weights of an expert or scorer, whose content is not checked.
 
-    Args:
-        spec: Value of the setting: a model of the registry, the path of an ONNX file (it need not exist), or
-            a plugin. For a plugin the result is None: keys of the store contain its package's version.
-        role: ``expert`` or ``scorer``.
-
-    Raises:
-        InputError: The name is unknown, or the model is not installed.
+    ``spec`` is a model of the registry, the path of an ONNX file (it need not exist), or a plugin. For a
+    plugin the result is None: keys of the store contain its package's version. InputError is raised if the
+    name is unknown, or the model is not installed.
     """
     model = registered(spec, role)
     if model is not None and model.shipped is not None:
@@ -176,17 +184,10 @@ def model_file(spec: str, role: Role) -> Path | None:
 def load_network(
     spec: str, role: Role, device: str, from_file: Callable[[Path, RegistryEntry | None], T]
 ) -> T:
-    """Load the expert or scorer that a setting names.
+    """Load the expert or scorer that a setting names, by `model_file`.
 
-    Args:
-        spec: Value of the setting, as in `model_file`.
-        role: ``expert`` or ``scorer``.
-        device: Device of the network.
-        from_file: Function that loads a file; it also receives the registry's entry or None. It is not used
-            for plugins.
-
-    Raises:
-        InputError: The name is unknown, or the model is not installed or damaged.
+    ``from_file`` loads a file; it also receives the registry's entry or None. It is not used for plugins.
+    InputError is raised if the name is unknown, or the model is not installed or damaged.
     """
     path = model_file(spec, role)
     if path is None:
@@ -201,8 +202,7 @@ def load_network(
 def verify(model: RegistryEntry, directory: Path) -> None:
     """Check that the file of an included model exists, or verify the digests of an installed model.
 
-    Raises:
-        InputError: A file is missing, or differs from the registry or from the receipt of the installation.
+    InputError is raised if a file is missing, or differs from the registry or from the receipt.
     """
     if model.shipped is not None:
         path = Path(__file__).parent / model.shipped

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cleargs.errors import InputError
 from cleargs.models.naturalness import StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import RegistryEntry, find_model, load_network
+from cleargs.models.registry import Network, RegistryEntry, find_model, load_network
 from cleargs.models.tiling import mean_over_tiles, require_scorable
 from cleargs.types import ImageF32
 
@@ -42,16 +42,8 @@ _LONGER_SIDES = (224, 384)
 _GRID = 10  # MUSIQ encodes positions on a grid with this number of cells per side
 
 
-class Scorer(Protocol):
+class Scorer(Network, Protocol):
     """A model that rates the quality of single images."""
-
-    @property
-    def name(self) -> str:
-        """Short name for tables."""
-
-    @property
-    def digest(self) -> str:
-        """Digest of the weights, part of the store key."""
 
     def score(self, image: ImageF32, *, threads: int = 1) -> float:
         """Return the score of an image, 0-100, higher is better.
@@ -107,12 +99,9 @@ def information(image: ImageF32) -> float:
 class LearnedScorer:
     """A scoring network in an ONNX file, which maps [N, 3, H, W] float32 sRGB in [0, 1] to N scores.
 
-    Args:
-        path: ONNX file.
-        name: Name for tables (None: the file name without its extension).
-        tile: Side of tiles whose mean is the score, px, so that the score depends little on the size of the
-            image. None: the whole image, or tiles of the network's fixed input size.
-        device: Device of the network, as `network_device` returns it.
+    ``name`` and ``device`` are those of an `OnnxExpert`. ``tile`` is the side of tiles whose mean is the
+    score, px, so that the score depends little on the size of the image. None: the whole image, or tiles of
+    the network's fixed input size.
 
     Raises:
         InputError: The file is missing, is not an ONNX model, or has other inputs or outputs.

@@ -90,12 +90,10 @@ def map_tiled(
     *,
     fixed: Sides = (None, None),
 ) -> ImageF32:
-    """Apply a function to overlapping tiles of an image, and blend the results to an image [H, W, 3].
+    """Apply a function to overlapping tiles of an image [H, W, 3], and blend the results to one.
 
-    Args:
-        function: Function that maps tiles [h, w, 3] of one size to tiles of that size, in their order.
-        image: Image [H, W, 3]. It is padded by reflection at the right and bottom if necessary.
-        fixed: Height and width of the tiles if the function requires them.
+    ``function`` maps tiles [h, w, 3] of one size, which is ``fixed`` where it requires that, to tiles of that
+    size, in their order. The image is padded by reflection at the right and bottom if necessary.
     """
     height, width = image.shape[:2]
     rows, columns = plan_axis(height, fixed[0]), plan_axis(width, fixed[1])
@@ -145,12 +143,10 @@ def require_scorable(image: AnyImage) -> None:
 def mean_over_tiles(
     function: Callable[[Sequence[ImageF32]], Iterable[float]], image: ImageF32, sides: Sides
 ) -> float:
-    """Return the mean of a function over evenly spaced tiles that cover an image.
+    """Return the mean of a function over evenly spaced tiles that cover an image [H, W, 3].
 
-    Args:
-        function: Function that maps tiles [h, w, 3] of one size to one number each, in their order.
-        image: Image [H, W, 3]. InputError is raised as by `require_scorable`.
-        sides: Height and width of a tile (None: the whole side), or less where the image is smaller.
+    ``function`` maps tiles [h, w, 3] of one size to one number each, in their order. A tile has these sides
+    (None: the whole side), or less where the image is smaller. InputError is raised as by `require_scorable`.
     """
     require_scorable(image)
     places = []

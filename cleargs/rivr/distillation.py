@@ -206,15 +206,15 @@ class TrainedScene:
     def trained(
         self,
         views: Sequence[TrainingView],
-        config: TrainConfig,
+        config: TrainConfig,  # with the part of the schedule
         folder: Path,
         *,
         seed: Sequence[int],
         label: str,
         round: int,
         pseudo_share: float | Literal["even"],
-        pseudo_weight: float,
-        repaired: float = 1.0,
+        pseudo_weight: float,  # factor on the loss of a repair
+        repaired: float = 1.0,  # share of the frames that have a repair
         reporter: Reporter,
     ) -> TrainedScene:
         """Continue the training on raw and repaired views, with Adam's moments; return the scene after it.
@@ -222,19 +222,9 @@ class TrainedScene:
         A finished training is read back. An interrupted one resumes from its checkpoint, which is deleted at
         the end.
 
-        Args:
-            views: Raw and repaired views.
-            config: Settings, with the part of the schedule.
-            folder: Folder of the training's results.
-            seed: Source of the training's randomness.
-            label: Name of the task in the progress.
-            round: Round of RIVR, for the log.
-            pseudo_share: Share of the steps that draw a repair; ``even`` draws each as often as any raw
-                frame.
-            pseudo_weight: Factor on the loss of a repair.
-            repaired: Share of the frames that have a repair. The share of the steps is reduced by it, since a
-                few repairs must not be drawn as often as all frames together.
-            reporter: Target of the progress.
+        A share ``pseudo_share`` of the steps draws a repair; ``even`` draws each as often as any raw frame.
+        The share is reduced by ``repaired``, since a few repairs must not be drawn as often as all frames
+        together.
         """
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / SCENE).exists():

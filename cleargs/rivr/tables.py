@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any
@@ -68,11 +68,9 @@ class Selection:
     @classmethod
     def not_tried(cls, frame_id: int, reason: str) -> Selection:
         """Return the row of a frame that is kept as filmed without a candidate."""
-        rows: dict[str, Any] = dict.fromkeys(field.name for field in fields(cls))
-        return cls(
-            **rows
-            | {"round": 1, "frame_id": frame_id, "chosen": "observed", "accepted": False, "reason": reason}
-        )
+        row: dict[str, Any] = dict.fromkeys(SELECTION.names)
+        row |= {"round": 1, "frame_id": frame_id, "chosen": "observed", "accepted": False, "reason": reason}
+        return cls(**row)
 
 
 @dataclass(frozen=True)

@@ -53,10 +53,7 @@ class QwenConfig(Settings):
     )
     max_tokens: int = Field(1024, ge=64, le=32_768, description="maximum length of a reply, in tokens")
     local_threads: int = Field(
-        4,
-        ge=1,
-        le=256,
-        description="CPU threads of a local model; its results depend on this number",
+        4, ge=1, le=256, description="CPU threads of a local model; its results depend on this number"
     )
     concurrency: Annotated[int, _NOT_IN_KEY] = Field(
         4, ge=1, le=256, description="maximum number of requests at the same time"

@@ -34,11 +34,8 @@ def make_evaluator(
 ) -> Evaluator:
     """Create the evaluator of the settings.
 
-    Args:
-        config: Name of the evaluator, and its settings.
-        seed: Seed of a model on a server, or of a plugin.
-        device: Device of a local model.
-        cache: Folder for results of single frames; None: no cache.
+    ``seed`` is that of a model on a server or of a plugin, ``device`` that of a local model. ``cache`` is a
+    folder for results of single frames; None: no cache.
 
     Raises:
         InputError: The evaluator is unavailable, for example because the address of its server is invalid.

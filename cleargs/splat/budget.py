@@ -37,16 +37,10 @@ def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
 
 
 def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: int) -> NDArray[np.float64]:
-    """Estimate the wall seconds of each step on two idle cores.
+    """Estimate the wall seconds of each step on two idle cores, [length].
 
-    Args:
-        config: Settings with steps and budget (`resolve_config`).
-        frames: Number of training frames.
-        megapixels: Megapixels per frame.
-        start: Number of Gaussians at the start.
-
-    Returns:
-        Seconds, [length]. Later steps take longer, as the number of Gaussians grows.
+    Later steps take longer, as the number of Gaussians grows from ``start``. ``megapixels`` are per frame.
+    ``config`` has steps and budget (`resolve_config`).
     """
     step = config.first + np.arange(config.length)
     reduced = np.where(step < config.coarse_share * config.planned, config.coarse_factor**2, 1.0)
@@ -62,16 +56,10 @@ def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: 
 def training_cost(
     config: TrainConfig, frames: int, megapixels: float, start: int | None = None
 ) -> tuple[float, float]:
-    """Estimate time and memory of a training.
+    """Estimate the wall seconds of a training on two idle cores, and its GB of memory without the images.
 
-    Args:
-        config: Settings; open steps and budget are set as in `resolve_config`.
-        frames: Number of training frames.
-        megapixels: Megapixels per frame.
-        start: Number of Gaussians at the start (None: the maximum number).
-
-    Returns:
-        Wall seconds on two idle cores, and GB of memory without the images.
+    It begins with ``start`` Gaussians (None: the maximum number). ``megapixels`` are per frame. Open steps
+    and budget are set as in `resolve_config`.
     """
     pixels = round(frames * megapixels * 1e6)
     budget = config.budget_for(pixels)

@@ -60,13 +60,7 @@ class Camera:
         """Return this camera for images resampled to ``width`` x ``height`` pixels."""
         x, y = width / self.width, height / self.height
         return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * x,
-            fy=self.fy * y,
-            cx=self.cx * x,
-            cy=self.cy * y,
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
         )
 
     def scaled(self, factor: float) -> Camera:

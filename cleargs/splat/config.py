@@ -38,11 +38,7 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
 
     It is one Gaussian (59 numbers at SH degree 3) per 80 pixels (240 numbers, most seen by several frames),
     times the factor of the quality. Fewer than 40,000 reduce the PSNR of small captures by 1 dB.
-
-    Args:
-        pixels: Number of pixels in all active frames.
-        max_budget: Upper limit at standard quality.
-        quality: Quality of the run.
+    ``max_budget`` is the upper limit at standard quality.
     """
     standard = min(max(pixels // PIXELS_PER_GAUSSIAN, MIN_BUDGET), max_budget)
     return max(1, int(BUDGET_FACTOR[quality] * standard))
@@ -115,12 +111,7 @@ class TrainConfig(Settings):
         "the factor of the quality",
     )
     begin: float = Field(0.0, ge=0, lt=1, description="start of this training in the schedule, as a fraction")
-    end: float = Field(
-        1.0,
-        gt=0,
-        le=1,
-        description="end of this training in the schedule, as a fraction",
-    )
+    end: float = Field(1.0, gt=0, le=1, description="end of this training in the schedule, as a fraction")
     background: tuple[Unit, Unit, Unit] | None = Field(
         None,
         description="sRGB behind the scene; unset = black, and in training a random colour at each step, so "
@@ -128,10 +119,7 @@ class TrainConfig(Settings):
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")
     coarse_share: float = Field(
-        0.25,
-        ge=0,
-        le=1,
-        description="fraction of the schedule, at its start, with reduced images; 0 = off",
+        0.25, ge=0, le=1, description="fraction of the schedule, at its start, with reduced images; 0 = off"
     )
 
     densify: bool = Field(True, description="split, move and add Gaussians during the training")

@@ -44,22 +44,13 @@ class Formation(Protocol):
     def form(
         self,
         view: TrainingView,
-        factor: float,
-        progress: float,
-        target: Tensor,  # [H, W, 3] sRGB
-        mask: Tensor | None,  # [H, W]
-        render: Renderer,
+        factor: float,  # scale of the training image in this step
+        progress: float,  # position in the schedule, 0 to 1
+        target: Tensor,  # [H, W, 3] sRGB at this scale
+        mask: Tensor | None,  # [H, W] pixels that count
+        render: Renderer,  # renders the current scene
     ) -> Formed | None:
-        """Return the image formation for a step on a view, or None to compare it with the plain render.
-
-        Args:
-            view: View of the step.
-            factor: Scale of the training image in this step.
-            progress: Position in the schedule, 0 to 1.
-            target: Training image at this scale.
-            mask: Pixels that count, or None.
-            render: Function that renders the current scene.
-        """
+        """Return the image formation for a step on a view, or None to compare it with the plain render."""
 
     def digest(self) -> str:
         """Return a digest of everything it starts from, which identifies its checkpoints."""

@@ -115,14 +115,10 @@ def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None
 def write_scene(
     path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: int | None = None
 ) -> None:
-    """Write a scene atomically.
+    """Write a scene atomically in the format ``kind``, as `format_of` returns it.
 
-    Args:
-        path: File to write.
-        scene: Scene to write.
-        kind: Format, as `format_of` returns it.
-        turned: True: the scene already has the axes of the file. False: it is rotated to them.
-        spz_version: Version of an SPZ file (None: 3).
+    The scene is rotated to the axes of the file unless it is ``turned`` already. An SPZ file has version 3
+    unless ``spz_version`` is another one.
     """
     target = _format(kind)
     if target.axes != _AS_IS and not turned:

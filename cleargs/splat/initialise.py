@@ -53,24 +53,18 @@ class SparsePoints:
 
 def starting_gaussians(
     sparse: SparsePoints,
-    views: Sequence[TrainingView],
+    views: Sequence[TrainingView],  # in the order of ``sparse.observed``
     *,
     at_least: int,
-    at_most: int | None,
-    sh_degree: int | None,
+    at_most: int | None,  # None: no limit
+    sh_degree: int | None,  # None: `sh_degree_from_views`
     seed: int,
     say: Callable[[str], None] = lambda remark: None,
 ) -> Gaussians:
-    """Return the Gaussians that a training starts from.
+    """Return the Gaussians that a training starts from, one per sparse point.
 
-    Args:
-        sparse: Sparse points: one Gaussian each.
-        views: Training views, in the order of ``sparse.observed``.
-        at_least: Minimum number of Gaussians; the missing ones are added behind random pixels of the views.
-        at_most: Maximum number of Gaussians (None: no limit); a random subset of the points is used.
-        sh_degree: Degree of the spherical harmonics (None: `sh_degree_from_views`).
-        seed: Seed of the random choices.
-        say: Function that receives a message if points are added or left out.
+    Missing ones are added behind random pixels of the views. If there are too many points, a random subset is
+    used. ``say`` receives a message in both cases.
     """
     most = at_most or max(at_least, len(sparse.xyz))
     if len(sparse.xyz) > most:

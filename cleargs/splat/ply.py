@@ -87,11 +87,7 @@ def read_ply(path: Path) -> Scene:
         for name, values in gaussians.tensors().items():
             if not bool(torch.isfinite(values).all()):
                 raise ValueError(f"some {name} are not finite")
-        return Scene(
-            gaussians,
-            antialias=comments.get(_ANTIALIAS, "none") == "mip",
-            background=background,
-        )
+        return Scene(gaussians, antialias=comments.get(_ANTIALIAS, "none") == "mip", background=background)
     except FAULTS as error:
         raise StoreError(
             f"cannot read the scene {path}: {cause(error)}",

@@ -50,11 +50,7 @@ class Schedule:
 
     In all methods ``step`` is the number of finished steps of the whole schedule. Rates of means are in units
     of the normalised world, so they need no factor for the extent of the scene (Inria: ``spatial_lr_scale``).
-
-    Args:
-        config: Settings with a number of steps (`cleargs.splat.budget.resolve_config`).
-        coefficients: Number of stored SH coefficients K.
-        device: Device of the Gaussians.
+    ``config`` has a number of steps (`cleargs.splat.budget.resolve_config`).
     """
 
     def __init__(self, config: TrainConfig, coefficients: int, device: torch.device | str = "cpu") -> None:

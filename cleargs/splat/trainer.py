@@ -105,8 +105,7 @@ class Trainer:
         self._gaussians = scene.gaussians.detach().clone().to(self._device)
         if fault := self._gaussians.fault():
             raise InputError(
-                f"the initial scene is damaged: {fault}",
-                hint="repeat the stage that wrote it with --force",
+                f"the initial scene is damaged: {fault}", hint="repeat the stage that wrote it with --force"
             )
         self._moments = Moments.zeros(self._gaussians) if moments is None else moments.to(self._device)
         self._earlier_steps = 0 if moments is None else config.first
@@ -117,14 +116,9 @@ class Trainer:
         self._losses = LossAccumulator(self._device, config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._image_gradients: dict[tuple[int, int], Tensor] = {}
-        arguments: list[float | str] = [
-            *self._seed,
-            self._earlier_steps,
-            self._pseudo_share,
-            pseudo_weight,
-            "" if formation is None else formation.digest(),
-        ]
-        self._fingerprint = _fingerprint(scene, weighted, config, arguments)
+        others: list[float | str] = [*self._seed, self._earlier_steps, self._pseudo_share, pseudo_weight]
+        others.append("" if formation is None else formation.digest())
+        self._fingerprint = _fingerprint(scene, weighted, config, others)
         self.done = 0
 
     def run(
@@ -273,9 +267,10 @@ class Trainer:
 
     def check_finite(self) -> None:
         """Raise StageError with the step and the parameter if a value is NaN or infinite."""
-        if fault := self._gaussians.fault():
-            raise self._error_at_step(fault)
-        if self._formation is not None and (fault := self._formation.fault()):
+        fault = self._gaussians.fault()
+        if fault is None and self._formation is not None:
+            fault = self._formation.fault()
+        if fault is not None:
             raise self._error_at_step(fault)
 
     def state(self) -> dict[str, Tensor]:

@@ -47,18 +47,10 @@ def write_clip(
     seed: int,
     reporter: Reporter,
 ) -> None:
-    """Write a video of a whole walk.
+    """Write a video of a whole walk as an MP4 file.
 
-    Args:
-        out: The MP4 file.
-        setup: The world and the lens.
-        rules: The protocol. Exposure and readout times are the same for all frames.
-        path: The walk.
-        faults: Faults of evenly spaced frames of the walk. Their exposure errors are interpolated.
-        look: Look of the camera.
-        fps: Frames per second.
-        seed: Seed of the noise.
-        reporter: Receives the progress.
+    Exposure and readout times are those of the first of ``faults``, which are of evenly spaced frames of the
+    walk. Their exposure errors are interpolated.
 
     Raises:
         InputError: if an exposure is longer than the time between frames, or differs between frames.
@@ -108,21 +100,13 @@ def _exposure(setup: SceneSetup, path: HandheldPath, time: float, fault: Fault) 
 
 
 def moved(
-    light: ArrayF64,  # [H, W, 3]
-    depth: ArrayF64,  # [h, w]
-    pose: ArrayF64,  # [3, 4]
+    light: ArrayF64,  # [H, W, 3] linear light of the view
+    depth: ArrayF64,  # [h, w] camera z of evenly spaced points, world units; 0 without a surface
+    pose: ArrayF64,  # [3, 4] camera to world
     lens: Lens,
     shutter: Shutter,
 ) -> ArrayF64:  # [H, W, 3]
-    """Return the mean of the views of ``shutter``, made by moving the pixels of one view.
-
-    Args:
-        light: Linear light of the view.
-        depth: Camera z of evenly spaced points of the view, world units; 0 without a surface.
-        pose: Pose of the view, camera to world.
-        lens: Lens of ``light``.
-        shutter: Poses of all rows in all samples, near ``pose``.
-    """
+    """Return the mean of the views of ``shutter``, made by moving the pixels of one view near them."""
     rows, columns = depth.shape
     x, y = np.meshgrid(
         (np.arange(columns) + 0.5) / columns * lens.width, (np.arange(rows) + 0.5) / rows * lens.height

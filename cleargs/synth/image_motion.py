@@ -84,14 +84,7 @@ class SimulatedMotion:
 
 
 def track_motion(path: HandheldPath, time: float, depth: ArrayF64, lens: Lens) -> SimulatedMotion:
-    """Prepare the points to track for a frame.
-
-    Args:
-        path: Path of the camera.
-        time: Middle of the exposure, seconds.
-        depth: Depth at that time [H, W], world units; 0 without a surface.
-        lens: Lens of the camera.
-    """
+    """Prepare the points to track around ``time``, where ``depth`` [H, W] is 0 without a surface."""
     columns = (np.arange(TRACK_GRID[0]) + 0.5) / TRACK_GRID[0] * lens.width
     rows = (np.arange(TRACK_GRID[1]) + 0.5) / TRACK_GRID[1] * lens.height
     x, y = np.meshgrid(columns, rows)

@@ -86,11 +86,7 @@ SEVERITIES = {
 class Household:
     """A person who walks through, a thing that is put elsewhere and back, and a screen that flickers.
 
-    Args:
-        room: The room without them.
-        duration: Duration of the capture, seconds.
-        seed: Seed of sizes, textures and flicker.
-        severity: Amount of movement.
+    ``room`` is without them. The capture takes ``duration`` seconds.
     """
 
     def __init__(self, room: Room, duration: float, seed: int, severity: Severity) -> None:

@@ -98,17 +98,14 @@ def disc(count: int, radius: float) -> ArrayF64:
 
 
 def distorted(
-    light: ArrayF64,  # [H, W, 3]
+    light: ArrayF64,  # [H, W, 3] linear
     lens: Lens,
-    coefficients: tuple[float, float, float, float],
+    coefficients: tuple[float, float, float, float],  # k1, k2, p1 and p2 of OpenCV's model
 ) -> ArrayF64:  # [H, W, 3]
     """Return what a lens with distortion makes of the image of ``lens``, which has none.
 
-    Args:
-        light: image in linear light.
-        lens: lens of ``light``.
-        coefficients: k1, k2, p1 and p2 of OpenCV's model. The ray of each pixel is found by fixed-point
-            iteration. Pixels whose ray is outside the image repeat its border.
+    The ray of each pixel is found by fixed-point iteration. Pixels whose ray is outside the image repeat its
+    border.
     """
     k1, k2, p1, p2 = coefficients
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)

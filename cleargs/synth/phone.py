@@ -69,25 +69,16 @@ PLAIN = Look()
 
 
 def develop(
-    image: ArrayF64,
+    image: ArrayF64,  # [H, W, 3] linear light; 1 is sensor white
     *,
-    stops: float = 0.0,
-    noise: float = 0.0,
-    rng: np.random.Generator | None = None,
+    stops: float = 0.0,  # exposure error
+    noise: float = 0.0,  # standard deviation at mid grey after the exposure error, sRGB units
+    rng: np.random.Generator | None = None,  # None: no noise
     look: Look = PLAIN,
-) -> ImageU8:
+) -> ImageU8:  # [H, W, 3]
     """Convert linear light to an 8-bit sRGB image, with exposure error, sensor noise, clipping and look.
 
-    Args:
-        image: Linear light [H, W, 3]; 1 is sensor white.
-        stops: Exposure error.
-        noise: Standard deviation of the noise at mid grey after the exposure error, sRGB units. 70 % of the
-            variance is shot noise, which depends on the signal. The rest is read noise.
-        rng: Generator of the noise; None: no noise.
-        look: Tone curve and sharpening of the camera.
-
-    Returns:
-        RGB [H, W, 3].
+    70 % of the variance of the noise is shot noise, which depends on the signal. The rest is read noise.
     """
     image = image * 2.0**stops
     if rng is not None:

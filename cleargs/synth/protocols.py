@@ -74,10 +74,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "gsotm-pn": Protocol(rotation_noise=0.4, translation_noise=0.005),
     # As with a depth sensor: the focal length of 7-Scenes is 13 % off, and its poses miss by 1.7 px.
     "camera": Protocol(
-        rotation_noise=0.4,
-        translation_noise=0.005,
-        focal_error=0.06,
-        distortion=(0.08, -0.03, 0.001, -0.001),
+        rotation_noise=0.4, translation_noise=0.005, focal_error=0.06, distortion=(0.08, -0.03, 0.001, -0.001)
     ),
     # Every fifth frame of a video with 30 frames per second and a shutter that is open 5/6 of the time.
     "phone": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True),
@@ -112,19 +109,11 @@ class Fault:
 def plan_faults(
     protocol: Protocol,
     motions: Sequence[SimulatedMotion],
-    luminances: Sequence[float],
-    rate: float,
+    luminances: Sequence[float],  # `cleargs.synth.phone.metered_luminance`, for automatic exposure
+    rate: float,  # frames per second
     seed: int,
 ) -> list[Fault]:
-    """Choose the fault of each frame of a walk.
-
-    Args:
-        protocol: The protocol of the capture.
-        motions: Image motion of each frame.
-        luminances: `cleargs.synth.phone.metered_luminance` of each frame; used for automatic exposure.
-        rate: Frames per second.
-        seed: Seed of the random faults.
-    """
+    """Choose the fault of each frame of a walk."""
     scale = motions[0].lens.width / REFERENCE_WIDTH
     if protocol.mixed:
         return _mixed(motions, scale, np.random.default_rng([seed, Stream.MIXED_FAULTS]))
@@ -176,14 +165,7 @@ def noisy_poses(
     depth: float,
     seed: int,
 ) -> NDArray[np.float64]:  # [F, 3, 4]
-    """Return the given poses: ``poses`` with noise.
-
-    Args:
-        poses: Exact poses.
-        protocol: Levels of the noise.
-        depth: Mean depth of the capture, world units.
-        seed: Seed of the noise.
-    """
+    """Return the given poses: ``poses`` with the noise of ``protocol`` at this mean depth, world units."""
     rng = np.random.default_rng([seed, Stream.POSE_NOISE])
     turns = np.radians(protocol.rotation_noise) * rng.standard_normal((len(poses), 3))
     shifts = protocol.translation_noise * depth * rng.standard_normal((len(poses), 3))

@@ -19,16 +19,7 @@ from cleargs.kernel_cache import configure_numba
 from cleargs.synth.movers import SEVERITIES, Balloon, Household, Movers
 from cleargs.synth.optics import PINHOLE, Aperture, Lens, Shutter, low_discrepancy, phone_lens
 from cleargs.synth.path import FPS, Orbit, SceneSetup
-from cleargs.synth.room import (
-    BOX,
-    LEVEL_STARTS,
-    LEVELS,
-    SIZE,
-    SPHERE,
-    TEXELS_PER_METRE,
-    Room,
-    make_room,
-)
+from cleargs.synth.room import BOX, LEVEL_STARTS, LEVELS, SIZE, SPHERE, TEXELS_PER_METRE, Room, make_room
 from cleargs.types import ArrayF64
 
 configure_numba("raycast")

@@ -231,17 +231,10 @@ def _expose(
     setup: SceneSetup,
     motion: SimulatedMotion,
     fault: Fault,
-    nearness: float,
-    rng: np.random.Generator,
+    nearness: float,  # mean of 1 / depth over the pixels that see a surface
+    rng: np.random.Generator,  # for the order of the points on the lens
 ) -> tuple[ArrayF64, ArrayF64]:
     """Render one frame with its motion and defocus.
-
-    Args:
-        setup: The world and the lens.
-        motion: Motion of the frame.
-        fault: Degradation of the frame.
-        nearness: Mean of 1 / depth over the pixels that see a surface.
-        rng: Generator for the order of the points on the lens.
 
     Returns:
         Linear light [H, W, 3], and per pixel [H, W] the share of the exposure that sees movement.

@@ -28,7 +28,7 @@ class Placer(sfm_worker._Sfm):
     def _extract(self, database: Path, names: Any, settings: Any) -> None:
         self.extracted.append(list(names))
 
-    def _match(self, database: Path, pairs: Any, settings: Any) -> None:
+    def _match(self, database: Path, pairs: Any, again: str = "") -> None:
         self.matched.append(len(pairs))
 
     def _continued(self, model: Any, database: Path, again: set[int], settings: Any) -> Any:

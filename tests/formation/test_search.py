@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -246,22 +245,3 @@ def test_the_equations_have_the_slopes_of_the_misfit() -> None:
     assert scale.min() > 1e-3
     # Linear interpolation flattens the slopes of waves of 60 px and more by less than a hundredth.
     assert (np.abs(side + slopes) / scale).max() < 0.03
-
-
-def test_search_runs_the_kernels_that_it_is_given(truth: Image) -> None:
-    """A back end passed to the search is the one that computes, down to the same bits."""
-
-    class Counting:
-        calls = 0
-
-        def __getattr__(self, name: str) -> Any:
-            Counting.calls += 1
-            return getattr(cpu, name)
-
-    seen = frame_pair(observe(truth, BLUR), truth)
-    given: Any = Counting()
-    first = refine(seen, "blur", BLUR, kernels=given)
-    assert Counting.calls > 2
-    for one, other in zip(first, refine(seen, "blur", BLUR), strict=True):
-        assert one.misfit == other.misfit
-        np.testing.assert_array_equal(one.motion.vector, other.motion.vector)

@@ -72,10 +72,7 @@ def read_llff(root: Path) -> list[SourceFrame]:
 def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
     """Return the rows of ``path``: a 3x5 pose, then nearest and farthest depth.
 
-    Pickled arrays are not loaded.
-
-    Raises:
-        InputError: the file contains no such array.
+    Pickled arrays are not loaded. InputError is raised if the file contains no such array.
     """
     import numpy as np
 

@@ -50,11 +50,7 @@ def detect(source: Path, *, poses: bool) -> bool:
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """See `Layout.externals`.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """See `Layout.externals`. Raises InputError if a file cannot be read."""
     files = _listings(source)
     found: dict[str, Path] = {}
     for file in files:
@@ -97,11 +93,7 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
 
     A frame's name is its ``file_path`` as listed, with the extension of the file found. Further entries, such
     as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``, are passed over.
-
-    Args:
-        path: transforms.json, or a file of the same form.
-        poses: also read cameras and poses.
-        notes: list that receives a note on missing images, which are left out. None: they are an error.
+    ``notes`` receives a note on missing images, which are left out. None: they are an error.
 
     Raises:
         InputError: damaged JSON, most images missing, missing or NaN poses, unknown cameras.
@@ -192,10 +184,9 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
 
 
 def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
-    """Return the values next to ``frames`` in transforms.json, and the entries of ``frames``.
+    """Return the values next to ``frames``, and its entries.
 
-    Raises:
-        InputError: the file is damaged, or an entry names no image.
+    Raises InputError if the file is damaged, or an entry names no image.
     """
     try:
         data = read_json(path)

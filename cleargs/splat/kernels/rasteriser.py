@@ -137,20 +137,10 @@ class Rasteriser(ABC):
         antialias: bool = False,
         depth: bool = False,
     ) -> Render:
-        """Render a view.
+        """Render a view of Gaussians on the rasteriser's device, as `cleargs.splat.render.render` does.
 
-        The parameters are read in place: do not change them between ``forward`` and ``backward``.
-
-        Args:
-            gaussians: Float32 Gaussians on the rasteriser's device.
-            camera: Camera of the view.
-            sh_degree: Largest SH degree in use; None for the stored one.
-            background: Colour behind the Gaussians, sRGB.
-            antialias: Apply the opacity compensation of Mip-Splatting.
-            depth: Render the accumulated depth, too; without it the depth of the result is None.
-
-        Returns:
-            Image, alpha and depth as `cleargs.splat.render.render` returns them. It raises the same errors.
+        The parameters are read in place: do not change them between ``forward`` and ``backward``. Without
+        ``depth`` the depth of the result is None.
         """
         if gaussians.means.dtype != torch.float32:
             raise InputError(

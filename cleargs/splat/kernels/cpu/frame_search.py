@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from cleargs.splat.kernels.cpu.frame_warp import between, bow, ess
+from cleargs.splat.kernels.cpu.frame_warp import aside, between, bow, ess
 from cleargs.splat.kernels.cpu.jit import kernel
 from cleargs.types import AnyArray, ArrayF32
 
@@ -56,8 +56,8 @@ def misfits(
                 at_x = place[0, n] + samples[k, 0] * along[0, n] + samples[k, 1] * wide[n]
                 at_y = place[1, n] + samples[k, 0] * along[1, n] + samples[k, 2] * wide[n]
                 if curve is not None:
-                    at_x += bow(samples[k, 0]) * bent[0, n] + ess(samples[k, 0]) * bent[2, n]
-                    at_y += bow(samples[k, 0]) * bent[1, n] + ess(samples[k, 0]) * bent[3, n]
+                    at_x += aside(samples[k, 0], bent[0, n], bent[2, n])
+                    at_y += aside(samples[k, 0], bent[1, n], bent[3, n])
                 i, a = between(at_x, right)
                 j, b = between(at_y, bottom)
                 above = image[j, i] + a * (image[j, i + 1] - image[j, i])
@@ -109,8 +109,8 @@ def normal_equations(
                 at_x = np.float32(x) + offset[0, y, x] + t * sweep[0, y, x]
                 at_y = np.float32(y) + offset[1, y, x] + t * sweep[1, y, x]
                 if curve is not None:
-                    at_x += bow(t) * curve[0, y, x] + ess(t) * curve[2, y, x]
-                    at_y += bow(t) * curve[1, y, x] + ess(t) * curve[3, y, x]
+                    at_x += aside(t, curve[0, y, x], curve[2, y, x])
+                    at_y += aside(t, curve[1, y, x], curve[3, y, x])
                 i, a = between(at_x, right)
                 j, b = between(at_y, bottom)
                 for c in range(3):

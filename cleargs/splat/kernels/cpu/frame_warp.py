@@ -72,25 +72,61 @@ def ess(t: Any) -> Any:
 
 
 @inlined
+def aside(t: Any, bend: Any, cube: Any) -> Any:
+    """Return the displacement from the straight path at a time of the exposure."""
+    return bow(t) * bend + ess(t) * cube
+
+
+@inlined
 def _curved_reach(bend: Any, cube: Any) -> Any:  # float32 -> float32
     """Return how far the curve leads a pixel from its straight path at most, px."""
     return np.float32(layout.BEND_REACH) * abs(bend) + np.float32(layout.CUBE_REACH) * abs(cube)
 
 
 @inlined
-def _inside(place: Any, sweep: Any, wide: Any, curved: Any, last: Any) -> Any:  # float32 -> bool
+def _path(
+    x: Any, y: Any, margin: Any, offset: Any, sweep: Any, radius: Any, curve: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Return the path of a pixel along each axis, and along both as pixels of `place_of`, and its disc.
+
+    A path is the place in the middle of the exposure, the sweep, the bend and the cube.
+    """
+    x0 = np.float32(x + margin) + offset[0, y, x]
+    y0 = np.float32(y + margin) + offset[1, y, x]
+    bend_x, bend_y, cube_x, cube_y = _ZERO, _ZERO, _ZERO, _ZERO
+    if curve is not None:
+        bend_x, bend_y, cube_x, cube_y = curve[0, y, x], curve[1, y, x], curve[2, y, x], curve[3, y, x]
+    across = x0, sweep[0, y, x], bend_x, cube_x
+    down = y0, sweep[1, y, x], bend_y, cube_y
+    start, along = place_of(x0, y0), place_of(across[1], down[1])
+    return across, down, (start, along, place_of(bend_x, bend_y), place_of(cube_x, cube_y)), radius[y, x]
+
+
+@inlined
+def _inside(path: Any, wide: Any, last: Any) -> Any:  # 4 float32, float32, float32 -> bool
     """Return True if all samples of a pixel are inside the image and not near its border; False for NaN.
 
     The point of a sample may be outside the unit disc by up to a tenth of its radius.
     """
-    far = _HALF * abs(sweep) + np.float32(1.1) * wide + _ONE + curved
+    place, sweep, bend, cube = path
+    far = _HALF * abs(sweep) + np.float32(1.1) * wide + _ONE + _curved_reach(bend, cube)
     return place - far >= _ZERO and place + far <= last
 
 
 @inlined
-def _seen_from(start: Any, along: Any, wide: Any, samples: Any, k: Any) -> Any:
-    """Return the position in the sharp image of the ``k``-th sample of a pixel."""
-    return start + along * samples[k, 0] + place_of(samples[k, 1], samples[k, 2]) * wide
+def _place_at(path: Any, disc: Any, t: Any, curve: Any) -> Any:
+    """Return the position in the sharp image of a pixel's sample at time ``t``, ``disc`` from the path."""
+    place, sweep, bend, cube = path
+    place = place + sweep * t + disc
+    return place if curve is None else place + bend * bow(t) + cube * ess(t)
+
+
+@inlined
+def _along_axis(path: Any, disc: Any, t: Any, curve: Any) -> Any:
+    """Return one coordinate of that position, for a path along one axis."""
+    place, sweep, bend, cube = path
+    place = place + t * sweep + disc
+    return place if curve is None else place + aside(t, bend, cube)
 
 
 @inlined
@@ -122,8 +158,14 @@ def _on_curve(curve: Any, value: Any) -> tuple[Any, Any]:  # [STEPS + 1], float3
 
 
 @inlined
-def _flow(x: Any, y: Any, near: Any, tx: Any, ty: Any, tz: Any, rx: Any, ry: Any, rz: Any) -> tuple[Any, Any]:
-    """Return the displacement, in units of fx, of a pixel on the ray (x, y, 1) under a twist."""
+def _twist(twists: Any, k: Any) -> Any:  # [5, 6] -> 6 float32
+    return twists[k, 0], twists[k, 1], twists[k, 2], twists[k, 3], twists[k, 4], twists[k, 5]
+
+
+@inlined
+def _flow(x: Any, y: Any, near: Any, twist: Any) -> tuple[Any, Any]:
+    """Return the displacement, in units of fx, of a pixel on the ray (x, y, 1) under a twist [6]."""
+    tx, ty, tz, rx, ry, rz = twist
     along_x = near * (x * tz - tx) + x * y * rx - (_ONE + x * x) * ry + y * rz
     along_y = near * (y * tz - ty) + (_ONE + y * y) * rx - x * y * ry - x * rz
     return along_x, along_y
@@ -163,22 +205,19 @@ def displacements(
                 near = min(motion[layout.MEDIAN] * covered / behind, np.float32(layout.MAX_NEARNESS))
             for part in range(2):
                 # Pose and skew give the offset, blur gives the sweep.
-                tx, ty, tz = twists[part, 0], twists[part, 1], twists[part, 2]
-                rx, ry, rz = twists[part, 3], twists[part, 4], twists[part, 5]
+                tx, ty, tz, rx, ry, rz = _twist(twists, part)
                 if part == 0:
                     tx, ty, tz = tx + down * twists[2, 0], ty + down * twists[2, 1], tz + down * twists[2, 2]
                     rx, ry, rz = rx + down * twists[2, 3], ry + down * twists[2, 4], rz + down * twists[2, 5]
                 field = offset if part == 0 else sweep
-                along_x, along_y = _flow(x, y, near, tx, ty, tz, rx, ry, rz)
+                along_x, along_y = _flow(x, y, near, (tx, ty, tz, rx, ry, rz))
                 field[0, row, column] = along_x
                 field[1, row, column] = along_y * (fy / fx)
             radius[row, column] = motion[layout.DISC] * abs(near - motion[layout.FOCUS])
             vertical = abs(offset[1, row, column]) + np.float32(0.5) * abs(sweep[1, row, column])
             if curve is not None:
                 for part in range(2):
-                    tx, ty, tz = twists[3 + part, 0], twists[3 + part, 1], twists[3 + part, 2]
-                    rx, ry, rz = twists[3 + part, 3], twists[3 + part, 4], twists[3 + part, 5]
-                    along_x, along_y = _flow(x, y, near, tx, ty, tz, rx, ry, rz)
+                    along_x, along_y = _flow(x, y, near, _twist(twists, 3 + part))
                     curve[2 * part, row, column] = along_x
                     curve[2 * part + 1, row, column] = along_y * (fy / fx)
                 vertical += _curved_reach(curve[1, row, column], curve[3, row, column])
@@ -222,29 +261,12 @@ def expose(
     cubic = len(samples) == 1
     for y in prange(height):
         for x in range(width):
-            x0 = np.float32(x + margin) + offset[0, y, x]
-            y0 = np.float32(y + margin) + offset[1, y, x]
-            along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
-            curved_x, curved_y = _ZERO, _ZERO
-            if curve is not None:
-                bend_x, bend_y, cube_x, cube_y = (
-                    curve[0, y, x],
-                    curve[1, y, x],
-                    curve[2, y, x],
-                    curve[3, y, x],
-                )
-                bend, cube = place_of(bend_x, bend_y), place_of(cube_x, cube_y)
-                curved_x, curved_y = _curved_reach(bend_x, cube_x), _curved_reach(bend_y, cube_y)
-            within = _inside(x0, along_x, wide, curved_x, right) and _inside(
-                y0, along_y, wide, curved_y, bottom
-            )
-            if within and not cubic:
-                start, along = place_of(x0, y0), place_of(along_x, along_y)
+            across, down, path, wide = _path(x, y, margin, offset, sweep, radius, curve)
+            if _inside(across, wide, right) and _inside(down, wide, bottom) and not cubic:
                 sums = black_pair()
                 for k in range(len(samples)):
-                    place = _seen_from(start, along, wide, samples, k)
-                    if curve is not None:
-                        place = place + bend * bow(samples[k, 0]) + cube * ess(samples[k, 0])
+                    disc = place_of(samples[k, 1], samples[k, 2]) * wide
+                    place = _place_at(path, disc, samples[k, 0], curve)
                     a, b = fractions_of(place)
                     at = offset_of(place, columns)
                     above, under = load_pair(image, at), load_pair(image, at + next_row)
@@ -253,19 +275,14 @@ def expose(
                 continue
             total = black()
             for k in range(len(samples)):
-                at_x = x0 + samples[k, 0] * along_x + samples[k, 1] * wide
-                at_y = y0 + samples[k, 0] * along_y + samples[k, 2] * wide
-                if curve is not None:
-                    at_x += bow(samples[k, 0]) * bend_x + ess(samples[k, 0]) * cube_x
-                    at_y += bow(samples[k, 0]) * bend_y + ess(samples[k, 0]) * cube_y
-                i, a = between(at_x, right)
-                j, b = between(at_y, bottom)
+                i, a = between(_along_axis(across, samples[k, 1] * wide, samples[k, 0], curve), right)
+                j, b = between(_along_axis(down, samples[k, 2] * wide, samples[k, 0], curve), bottom)
                 if cubic:
-                    across, weights = _neighbours(i, columns), _cubic(a)
-                    down, parts = _neighbours(j, rows), _cubic(b)
+                    near_x, weights = _neighbours(i, columns), _cubic(a)
+                    near_y, parts = _neighbours(j, rows), _cubic(b)
                     for m in range(4):
                         for n in range(4):
-                            at = CHANNELS * (down[m] * columns + across[n])
+                            at = CHANNELS * (near_y[m] * columns + near_x[n])
                             total = total + load_pixel(image, at) * (parts[m] * weights[n])
                     continue
                 at = CHANNELS * (np.int64(j) * columns + i)
@@ -307,49 +324,27 @@ def spread(
         for y in range(band * BAND, min((band + 1) * BAND, height)):
             for x in range(width):
                 seen = load_pixel(light, CHANNELS * (y * width + x)) * share
-                x0 = np.float32(x + margin) + offset[0, y, x]
-                y0 = np.float32(y + margin) + offset[1, y, x]
-                along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
-                curved_x, curved_y = _ZERO, _ZERO
-                if curve is not None:
-                    bend_x, bend_y, cube_x, cube_y = (
-                        curve[0, y, x],
-                        curve[1, y, x],
-                        curve[2, y, x],
-                        curve[3, y, x],
-                    )
-                    bend, cube = place_of(bend_x, bend_y), place_of(cube_x, cube_y)
-                    curved_x, curved_y = _curved_reach(bend_x, cube_x), _curved_reach(bend_y, cube_y)
-                within = _inside(x0, along_x, wide, curved_x, right) and _inside(
-                    y0, along_y, wide, curved_y, bottom
-                )
-                if within and not cubic:
-                    start, along = place_of(x0, y0), place_of(along_x, along_y)
+                across, down, path, wide = _path(x, y, margin, offset, sweep, radius, curve)
+                if _inside(across, wide, right) and _inside(down, wide, bottom) and not cubic:
                     twice = both(seen)
                     for k in range(len(samples)):
-                        place = _seen_from(start, along, wide, samples, k)
-                        if curve is not None:
-                            place = place + bend * bow(samples[k, 0]) + cube * ess(samples[k, 0])
+                        disc = place_of(samples[k, 1], samples[k, 2]) * wide
+                        place = _place_at(path, disc, samples[k, 0], curve)
                         a, b = fractions_of(place)
                         at = offset_of(place, columns) - CHANNELS * first * columns
-                        across = shares(a)
-                        store(part, at, load_pair(part, at) + twice * (across * (_ONE - b)))
-                        store(part, at + next_row, load_pair(part, at + next_row) + twice * (across * b))
+                        sides = shares(a)
+                        store(part, at, load_pair(part, at) + twice * (sides * (_ONE - b)))
+                        store(part, at + next_row, load_pair(part, at + next_row) + twice * (sides * b))
                     continue
                 for k in range(len(samples)):
-                    at_x = x0 + samples[k, 0] * along_x + samples[k, 1] * wide
-                    at_y = y0 + samples[k, 0] * along_y + samples[k, 2] * wide
-                    if curve is not None:
-                        at_x += bow(samples[k, 0]) * bend_x + ess(samples[k, 0]) * cube_x
-                        at_y += bow(samples[k, 0]) * bend_y + ess(samples[k, 0]) * cube_y
-                    i, a = between(at_x, right)
-                    j, b = between(at_y, bottom)
+                    i, a = between(_along_axis(across, samples[k, 1] * wide, samples[k, 0], curve), right)
+                    j, b = between(_along_axis(down, samples[k, 2] * wide, samples[k, 0], curve), bottom)
                     if cubic:
-                        across, weights = _neighbours(i, columns), _cubic(a)
-                        down, parts = _neighbours(j, rows), _cubic(b)
+                        near_x, weights = _neighbours(i, columns), _cubic(a)
+                        near_y, parts = _neighbours(j, rows), _cubic(b)
                         for m in range(4):
                             for n in range(4):
-                                at = CHANNELS * ((down[m] - first) * columns + across[n])
+                                at = CHANNELS * ((near_y[m] - first) * columns + near_x[n])
                                 _add(part, at, seen, parts[m] * weights[n])
                         continue
                     at = CHANNELS * (np.int64(j - first) * columns + i)

@@ -116,12 +116,7 @@ def row_total(values: ArrayF32, length: int) -> float:
 
 @kernel
 def measure(
-    image: ArrayF32,
-    target: ArrayF32,
-    counted: ArrayF32,
-    window: ArrayF32,
-    maps: ArrayF32,
-    row_sums: AnyArray,
+    image: ArrayF32, target: ArrayF32, counted: ArrayF32, window: ArrayF32, maps: ArrayF32, row_sums: AnyArray
 ) -> None:
     """Write the sums of |x - y|, of SSIM and of counted values in each padded row, [H, 3] float64.
 

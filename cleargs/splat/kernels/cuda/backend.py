@@ -6,10 +6,6 @@ import torch
 from torch import Tensor
 
 from cleargs.splat.gaussians import Gaussians
-
-# There are no GPU kernels for the search of a frame's motion.
-from cleargs.splat.kernels.cpu.backend import misfit as misfit
-from cleargs.splat.kernels.cpu.backend import normal_equations as normal_equations
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.cuda.densify import add_position_noise as add_position_noise
 from cleargs.splat.kernels.cuda.densify import refine as refine
