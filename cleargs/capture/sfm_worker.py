@@ -77,7 +77,7 @@ _FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
 _FEW, _FAINT = 0.25, 0.002
 """Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
-plain frames, through which a chain of frames loses its scale (docs/experiments/poses.md)."""
+plain ones, in which COLMAP finds few or none (docs/experiments/poses.md)."""
 _AGAIN = (
     _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),
     _FeatureSettings("sfm with fainter features", neighbours=True, contrast=0.001, inliers=15),
