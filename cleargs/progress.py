@@ -115,6 +115,18 @@ class ForwardingTask(CountedTask):
         super().update(done=done, note=note, share=share)
 
 
+class SilentReporter:
+    """A reporter that discards everything."""
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        yield CountedTask(total, lambda done, note, left: None)
+
+    def info(self, text: str) -> None: ...
+
+    def warn(self, text: str) -> None: ...
+
+
 class LineReporter:
     """A reporter that passes lines to functions: remarks, warnings, and the progress of each task."""
 
@@ -143,13 +155,6 @@ class LineReporter:
 
     def warn(self, text: str) -> None:
         self._warn(text)
-
-
-class SilentReporter(LineReporter):
-    """A reporter that discards everything."""
-
-    def __init__(self) -> None:
-        super().__init__(*[lambda text: None] * 3)
 
 
 def log_reporter() -> LineReporter:
