@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,13 @@ PLANES = ((4.0, -3.0, -2.5, 6.0), (3.0, -1.4, -0.9, 1.5), (2.5, 0.3, -0.3, 1.3))
 """Squares facing +z: depth, left, top, size. Far ones first, as painters work."""
 
 
-@dataclass
 class RecordingReporter(SilentReporter):
     """Keeps the warnings and the remarks."""
 
-    warnings: list[str] = field(default_factory=list)
-    infos: list[str] = field(default_factory=list)
+    def __init__(self) -> None:
+        super().__init__()
+        self.warnings: list[str] = []
+        self.infos: list[str] = []
 
     def info(self, text: str) -> None:
         self.infos.append(text)
