@@ -38,7 +38,7 @@ _GROWTH = (
 """Settings of the earlier trainings that had no effect on the later ones."""
 
 
-def other_libraries(device: Device) -> Mapping[str, str]:
+def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     """Return the versions of the other libraries that compute on ``device`` in rivr and consolidate."""
     from cleargs.models.onnx import runtime_version
 

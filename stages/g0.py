@@ -64,7 +64,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 26
+VERSION = 27
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -76,7 +76,7 @@ LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
 
-def other_libraries(device: Device) -> Mapping[str, str]:
+def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     """Return further libraries that compute on ``device``."""
     return {"triton": installed_version("triton")} if device == "cuda" else {}
 
@@ -104,7 +104,7 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
     start = max(config.min_points, sparse_points(context))
     seconds, memory = training_cost(config, count, megapixels, start)
     seconds *= pace(context.threads)
-    disk = 0.7 * memory  # scene and state: 1 kB a Gaussian
+    disk = 0.5 * memory  # scene and moments: 0.7 kB per Gaussian of SH degree 3
     memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
     return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=disk)
 
@@ -149,7 +149,13 @@ def run(context: StageContext[G0Config]) -> StageResult:
         say=lambda remark: context.reporter.info(f"G0: {remark}"),
     )
     exposure, spread = _exposure(config, views, sparse)
-    formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
+    formation = CaptureFormation(
+        views,
+        config.formation,
+        exposure=exposure,
+        lr_exposure=config.lr_exposure,
+        draft=config.quality == "draft",
+    )
     trainer = Trainer(
         Scene(gaussians, config.antialias, config.background),
         views,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
+from cleargs.plugins import installed_version
 from cleargs.rva.config import AssessmentConfig, EvaluatorConfig
 
 
@@ -21,7 +22,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
 }
 OUTPUTS = ("frames.parquet", "bins.parquet")
 LEFTOVERS: tuple[str, ...] = ()
-LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "torch", "transformers")
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless")
 
 _SECONDS_PER_MEGAPIXEL = 0.1  # on one core, including decoding
 _REPLIES_PER_MINUTE = 20  # from a vision-language model, per connection: a guess, since the server is unknown
@@ -32,6 +33,12 @@ def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
     if config.evaluator == "qwen3-vl" and config.qwen.model_dir:
         return {"vlm": Path(config.qwen.model_dir).expanduser().absolute()}
     return {}
+
+
+def other_libraries(device: Device, config: RvaConfig) -> Mapping[str, str]:
+    """Return the libraries of a vision-language model, if it runs in this process."""
+    local = externals(config, Path())
+    return {name: installed_version(name) for name in ("torch", "transformers") if local}
 
 
 def preflight(config: RvaConfig) -> None:

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, threads_option
+from cleargs.cli.common import (
+    fail_below_option,
+    json_option,
+    print_json,
+    quiet_option,
+    report_below,
+    threads_option,
+)
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import file_digest
 from cleargs.errors import InputError
@@ -110,6 +117,7 @@ stages and options stay there as long as their scenes do.
 )
 @click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
+@fail_below_option("psnr, ssim ...")
 @threads_option
 @click.option("-v", "--per-image", is_flag=True, help="Show every image in the table.")
 @json_option
@@ -129,11 +137,12 @@ def eval(
     refine_poses: int,
     save_renders: Path | None,
     output: Path | None,
+    fail_below: dict[str, float],
     threads: int,
     per_image: bool,
     as_json: bool,
     quiet: bool,
-) -> None:
+) -> int:
     """Compare a scene with sharp images: PSNR, SSIM, LPIPS and no-reference scores.
 
     Images are rendered at the reference's size without exposure compensation and compared as 8-bit sRGB.
@@ -185,6 +194,7 @@ def eval(
         _print(report, per_image, output)
         for line in filter(None, map(_with_colours_aligned, report.evaluations)):
             click.echo(line)
+    return int(report_below({found.subject: found.means for found in report.evaluations}, fail_below))
 
 
 def _with_colours_aligned(evaluation: Evaluation) -> str:

@@ -1,9 +1,10 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-The first look at a frame searches it. The next looks follow after every `FormationConfig.every` steps on it.
-They refine its motion with the scene of that time. A test of a few milliseconds (`pretest`) says if blur is
-left that nothing explains, and only then the frame is searched again. The sharper the scene becomes, the more
-blur the test finds. At every fourth look a path of a higher order is tried.
+The first look at a frame searches it, except in a draft. The next looks follow after every
+`FormationConfig.every` steps on it. They refine its motion with the scene of that time. A test of a few
+milliseconds (`pretest`) says if blur is left that nothing explains, and only then the frame is searched
+again. The sharper the scene becomes, the more blur the test finds. At every fourth look a path of a higher
+order is tried.
 
 Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
 is searched at the first look of a training and at every fourth one, since the test cannot see a skew.
@@ -80,6 +81,7 @@ class CaptureFormation:
         exposure: Exposure | None = None,
         lr_exposure: float = 0.0,
         known: Mapping[int, FrameFormation] | None = None,
+        draft: bool = False,
     ) -> None:
         """Begin with what is known of the frames.
 
@@ -89,9 +91,10 @@ class CaptureFormation:
             exposure: Colour affines to begin with; None for a training without any.
             lr_exposure: Learning rate of the affines.
             known: Formations that an earlier training has found, by frame_id.
+            draft: Search frames only where the test finds blur, also at the first look.
         """
         weighted = [view for view in views if view.weight > 0.0]
-        self._config = config
+        self._config, self._draft = config, draft
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
         real = sorted(view.frame_id for view in weighted if view.kind == "real")
         known = known or {}
@@ -159,6 +162,7 @@ class CaptureFormation:
                 rolling=self._rolls(),
                 again=(frame.draws // self._config.every) % SEARCH_EVERY == 0,
                 test_rolling=frame_id in self._tested and frame.skew_gain is None,
+                draft=self._draft,
             )
 
         begun = progress >= self._config.start

@@ -94,6 +94,7 @@ def fit_motion(
     rolling: bool = False,
     test_rolling: bool = False,
     again: bool = False,
+    draft: bool = False,
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
@@ -115,6 +116,7 @@ def fit_motion(
         rolling: Admit models with a skew.
         test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
         again: Try a path of a higher order, and search a frame of a rolling shutter again.
+        draft: Search the first time, too, only if the test finds blur.
     """
     # A formation that was found under the other assumption about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
@@ -129,7 +131,7 @@ def fit_motion(
     best = _accepted(followed, found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
     skews = rolling or test_rolling
-    first = frame.draws == 0  # a scene that is still soft hides short blurs from the test
+    first = frame.draws == 0 and not draft  # a scene that is still soft hides short blurs from the test
     asked = first or untested or test_rolling or (rolling and again) or not _admitted(frame.model, rolling)
     enough = DOUBTED_EVIDENCE if doubted else EVIDENCE
     if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):

@@ -200,7 +200,7 @@ IMAGE_BYTES = 8_500_000
 _BYTES_PER_PIXEL = 0.18  # in JPEG files at _QUALITY
 _SIDE_MAX, _SIDE_MIN = 960, 240  # limits of the long side of a layer, px
 _THUMBNAIL, _QUALITY = 240, 84  # long side, px; JPEG quality
-_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # of a drawn path and its border
+_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # colours of the border of a drawn path, and of the path
 
 MAX_RENDERED = 40
 """Maximum number of frames, evenly along the trajectory, for which the final scene is rendered. It limits the

@@ -126,8 +126,8 @@ def run_round(
                 row, image = repair(number, view, exr, scene, rules)
                 write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
-            tally = ", ".join(f"{count} {name}" for name, count in chosen_counts(rows).items())
-            task.update(done=len(rows), note=tally)
+            kept = chosen_counts(rows)["observed"]
+            task.update(done=len(rows), note=f"{kept} kept as filmed, {len(rows) - kept} repaired")
     return rows
 
 

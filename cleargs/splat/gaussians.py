@@ -57,6 +57,9 @@ class Gaussians:
                 f"sh has {k} coefficients per channel", hint="give 1, 4, 9 or 16 of them (degree 0 to 3)"
             )
 
+    def __repr__(self) -> str:
+        return f"<{self.num} Gaussians, SH degree {self.sh_degree}, on {self.device}>"
+
     @property
     def num(self) -> int:
         """Number of Gaussians N."""

@@ -55,7 +55,7 @@ class Trained:
     rows: pa.Table
     """Log with one row per step, schema `cleargs.splat.tables.TRAIN`."""
     state: dict[str, Tensor]
-    """Content of ``state.safetensors``, from which the next training continues."""
+    """Content of ``state.safetensors``, from which the next training continues: all but the parameters."""
 
 
 class Trainer:
@@ -176,7 +176,7 @@ class Trainer:
                     raise KeyboardInterrupt
             self.check_finite()
             self._show(task, fractions, rate)
-        state = {name: tensor.cpu() for name, tensor in self.state().items()}
+        state = {k: tensor.cpu() for k, tensor in self.state().items() if not k.startswith("parameter.")}
         return Trained(self.scene.to("cpu"), self.rows(round), state)
 
     def _warm_up(self, reporter: Reporter) -> None:

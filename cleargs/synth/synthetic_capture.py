@@ -17,7 +17,7 @@ from cleargs.media.encode import require_even, write_video
 from cleargs.media.exr import write_depth
 from cleargs.media.image import write_rgb
 from cleargs.parquet import column, write_table
-from cleargs.progress import Reporter
+from cleargs.progress import Reporter, log_reporter
 from cleargs.random_streams import Stream
 from cleargs.synth.clip import write_clip
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
@@ -75,14 +75,14 @@ FRAMES = pa.schema(
 
 
 def make_capture(
-    out: Path,
-    protocol: str,
+    out: str | Path,
+    protocol: str = "mixed",
     *,
-    frames: int,
-    width: int,
-    height: int,
-    seed: int,
-    reporter: Reporter,
+    frames: int = 16,
+    width: int = 480,
+    height: int = 270,
+    seed: int = 0,
+    reporter: Reporter | None = None,
     setup: SceneSetup | None = None,
     video: bool = False,
     seconds: float | None = None,
@@ -105,7 +105,7 @@ def make_capture(
         width: Width of the images, px.
         height: Height of the images, px.
         seed: Seed of the room, the walk and the faults.
-        reporter: Receives the progress.
+        reporter: Receives the progress (default: the logger ``cleargs``).
         setup: World, course and lens for this number and size of frames; None: the room of ``seed``.
         video: Also write ``out/capture.mp4``, which the protocol phone always has.
         seconds: Length of the walk. The frames are evenly spaced in it. None: `FPS` frames per second, or
@@ -118,7 +118,11 @@ def make_capture(
 
     Raises:
         InputError: if the protocol is unknown, the folder is not empty, or a video cannot have this size.
+
+    Example:
+        cg.make_capture("small", "gs2e-medium", frames=4, width=96, height=64)
     """
+    out, reporter = Path(out), reporter or log_reporter()
     rules = find_protocol(protocol)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")

@@ -262,3 +262,24 @@ def test_cameras_on_a_line_align_nothing(shell: Shell, tmp_path: Path) -> None:
     sfm = write_run(tmp_path / "sfm", make_scene(), row, poses="sfm")
     folder = write_reference(tmp_path / "row", make_scene(), row, similarity=WORLD)
     fails(shell(sfm, "--reference", folder, *FAST), "line")
+
+
+def test_novel_views_are_aligned_by_the_observed_ones(shell: Shell, tmp_path: Path) -> None:
+    """Views off the path have the stems of other frames. Once, the worlds were aligned by these."""
+    scene, views = make_scene(), cameras()
+    sfm = write_run(tmp_path / "sfm", scene, views, poses="sfm")
+    write_reference(tmp_path / "truth" / "observed", scene, views, similarity=WORLD)
+    novel = write_reference(tmp_path / "truth" / "novel", scene, views[::-1], similarity=WORLD)
+    code, out, _ = shell(sfm, "--reference", novel, *FAST)
+    assert code == 0 and "residual 0.00%" in out
+    (novel.parent / "observed").rename(tmp_path / "elsewhere")
+    fails(shell(sfm, "--reference", novel, *FAST), "too large for a comparison")
+
+
+def test_a_figure_below_its_limit_fails(shell: Shell, run: Path, truth: Path) -> None:
+    given = (run, "--reference", truth, *FAST, "--fail-below")
+    code, out, _ = shell(*given, "psnr=1")
+    assert code == 0 and "PSNR" in out
+    code, out, err = shell(*given, "psnr=200", "--fail-below", "ssim=0")
+    assert code == 1 and "PSNR" in out and "below the limit: rivr: psnr" in err and "ssim" not in err
+    assert "choose one of" in shell(*given, "psrn=20")[2]

@@ -226,6 +226,14 @@ def test_every_frame_is_searched_at_the_first_look(tmp_path: Path, searched: lis
     assert len(searched) == FRAMES
 
 
+def test_a_draft_searches_only_frames_with_evidence(tmp_path: Path, searched: list[FramePair]) -> None:
+    first = {k: FrameFormation(k, skew_gain=NO_TEST) for k in range(FRAMES)}
+    formation = CaptureFormation(views(), LOOK, known=first, draft=True)
+    run(tmp_path, views(), formation)
+    assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
+    assert len(searched) == 1
+
+
 def test_later_only_a_frame_with_evidence_is_searched(tmp_path: Path, searched: list[FramePair]) -> None:
     """After that its motion is followed."""
     formation = CaptureFormation(views(), LOOK, known=known())

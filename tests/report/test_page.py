@@ -10,7 +10,7 @@ from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from report_run import COUNT, HOSTILE, FinishedRun, wall
 from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
-from cleargs.manifest import linked_manifest, write_manifest
+from cleargs.manifest import Manifest, linked_manifest, write_manifest
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import StageOutcome
@@ -34,7 +34,7 @@ from cleargs.report.page import (
     weight_colour,
     write_report,
 )
-from cleargs.report.report_json import LastRun, is_current, linked_manifests
+from cleargs.report.report_json import LastRun, cameras_of, is_current, linked_manifests
 from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import SCENE_BYTES, shown_degree, write_scene
 from cleargs.rivr.tables import Selection
@@ -46,6 +46,24 @@ def test_a_frame_that_was_not_tried_says_why() -> None:
     row = FrameRow(frame, rounds=(Selection.not_tried(3, reason),))
     data = frame_data(row, {}, None)
     assert (data["repair"], data["why"], data["scores"]) == ("none: the raw frame is kept", reason, {})
+
+
+@pytest.mark.parametrize(
+    ("poses", "errors", "expected"),
+    [
+        ("input", None, ("given", None, None)),
+        ("input", {"given": 0.9, "adjusted": 0.8}, ("given", 0.9, 0.9)),
+        ("refined", {"given": 1.7, "adjusted": 0.3}, ("adjusted", 1.7, 0.3)),
+        ("sfm", {"given": 1.7, "adjusted": 0.6, "sfm": 0.3}, ("sfm over given", 1.7, 0.3)),
+        ("sfm", None, ("sfm", None, None)),
+    ],
+)
+def test_the_report_says_how_cameras_were_placed(poses: str, errors: Any, expected: tuple[Any, ...]) -> None:
+    lenses = [{"lens": "OPENCV", "focal_px": 518.0, "frames": 96}]
+    summary = {"poses": poses, "kept_out_matches_off_px": errors, "cameras": lenses, "placed": {"given": 96}}
+    found = cameras_of({"ingest": cast(Manifest, SimpleNamespace(summary=summary))})
+    assert tuple(found[name] for name in ("method", "off_px_before", "off_px")) == expected
+    assert found["lenses"] == lenses and cameras_of({}) == {}
 
 
 @pytest.fixture(scope="module")

@@ -429,6 +429,16 @@ def test_nan_errors_name_step_and_parameter(pictures: list[np.ndarray], tmp_path
         run(pictures, tmp_path, CONFIG.model_copy(update={"lr_scales": math.inf}))
 
 
+def test_a_finished_state_leaves_the_parameters_to_the_scene(
+    pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    done = run(pictures, tmp_path)
+    save_state(tmp_path / "finished.safetensors", done.state)
+    assert not any(name.startswith("parameter.") for name in done.state)
+    moments = read_moments(tmp_path / "finished.safetensors", done.scene.gaussians)
+    assert moments.first["means"].abs().max() > 0
+
+
 def poison(monkeypatch: pytest.MonkeyPatch, after: int, change: Callable[[Trainer], None]) -> None:
     """Damage every training after ``after`` steps."""
     step = Trainer.step
