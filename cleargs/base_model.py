@@ -61,5 +61,10 @@ class Settings(FrozenModel):
 def _alike(now: Any, value: Any) -> bool:
     """Return True if ``value``, from a TOML or JSON document, equals the present value ``now``."""
     if isinstance(value, Mapping):
+        if isinstance(now, BaseModel):  # by its validators: a value may have another form than in the past
+            fields = {name: inner for name, inner in value.items() if name in type(now).model_fields}
+            if type(now).model_validate({**now.model_dump(), **fields}) != now:
+                return False
+            value = {name: inner for name, inner in value.items() if name not in fields}
         return all(_alike(getattr(now, name, inner), inner) for name, inner in value.items())
     return bool((list(now) if isinstance(now, tuple) else now) == value)

@@ -114,7 +114,7 @@ def fit_motion(
         doubted: RVA doubts the frame, so less evidence is needed for a search.
         rolling: Admit models with a skew.
         test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
-        again: Try a path of a higher order, and search a frame of a rolling shutter again.
+        again: Try a path of a higher order, and search a frame with a curved path, or of a rolling shutter.
         draft: Search the first time, too, only if the test finds blur.
     """
     # A formation that was found under the other assumption about the shutter is searched again.
@@ -130,7 +130,9 @@ def fit_motion(
     evidence = _unexplained(pair, rendered, best)
     skews = rolling or test_rolling
     first = frame.draws == 0 and not draft  # a scene that is still soft hides short blurs from the test
-    asked = first or untested or test_rolling or (rolling and again) or not _admitted(frame.model, rolling)
+    # A descent with many unknowns that began in a soft scene can end in a wrong path and stay there.
+    again = again and (rolling or followed.motion.order > 1)
+    asked = first or untested or test_rolling or again or not _admitted(frame.model, rolling)
     enough = DOUBTED_EVIDENCE if doubted else EVIDENCE
     if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)

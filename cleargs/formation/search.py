@@ -78,14 +78,16 @@ def search(
     begun = _best(coarse, starts, models[0], LEVELS[0][1], pose)
     found: list[tuple[Model, FrameMotion]] = [("none", still)]
     for model in models:
-        motion = _restricted(begun, model)
+        straight = curved = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
-            motion = _best(level, [motion, still], model, steps, pose)
-        found.append((model, motion))
-        if BLUR in _ACTIVE[model] and motion.blur.any():
-            for order in range(2, MAX_ORDER + 1):
-                motion = _best(levels[-1], [motion], model, LEVELS[-1][1], pose, order)
-                found.append((model, motion))
+            straight = _best(level, [straight, still], model, steps, pose)
+            if BLUR in _ACTIVE[model] and level is not levels[-1]:
+                start = min(straight, curved, key=level.cost)
+                curved = _best(level, [start], model, steps, pose, MAX_ORDER)
+        found.append((model, straight))
+        if straight.blur.any() or curved.blur.any():
+            paths = _curved(levels[-1], straight, curved, model, LEVELS[len(levels) - 1][1], pose)
+            found += [(model, path) for path in paths]
     if defocus:
         disc = _sharpest_disc(coarse, still)
         for level in levels[1:]:
@@ -142,13 +144,30 @@ def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
 def _best(
     level: Level, starts: list[FrameMotion], model: Model, steps: int, pose: bool, order: int = 1
 ) -> FrameMotion:
-    """Return the best end of the descents from ``starts`` with a path of ``order``."""
-    parts = [*_ACTIVE[model], *((BEND, CUBE)[: order - 1])]
-    active = np.concatenate(
-        [np.arange(len(TWISTS) * TWIST)[part] for part in ([POSE] if pose else []) + parts]
-    )
-    ends = [_descend(level, start, active, steps) for start in starts]
+    """Return the best end of the descents from ``starts`` with a path of ``order``.
+
+    A pose that is not corrected is that at the middle of the exposure. Where the path bends, the mean pose is
+    a twelfth of the bend away from it.
+    """
+    bends = order > 1
+    parts = [*([POSE] if pose or bends else []), *_ACTIVE[model], *((BEND, CUBE)[: order - 1])]
+    active = np.concatenate([np.arange(len(TWISTS) * TWIST)[part] for part in parts])
+    unknowns = None
+    if bends and not pose:
+        unknowns = np.eye(len(active))[:, TWIST:]
+        rows = np.arange(TWIST)
+        unknowns[rows, np.searchsorted(active[TWIST:], BEND.start + rows)] = 1.0 / 12.0
+    ends = [_descend(level, start, active, steps, unknowns) for start in starts]
     return min(ends, key=level.cost)
+
+
+def _curved(
+    level: Level, straight: FrameMotion, curved: FrameMotion, model: Model, steps: int, pose: bool
+) -> list[FrameMotion]:
+    """Return the quadratic and the cubic path at the finest level, from those of the levels before."""
+    quadratic = _best(level, [straight], model, steps, pose, 2)
+    start = min(quadratic, curved, key=level.cost)
+    return [quadratic, _best(level, [start], model, steps, pose, MAX_ORDER)]
 
 
 def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
@@ -208,18 +227,26 @@ def _narrowed(level: Level, disc: FrameMotion) -> FrameMotion:
     return best
 
 
-def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps: int) -> FrameMotion:
-    """Run Levenberg-Marquardt over the ``active`` numbers from ``motion``."""
+def _descend(
+    level: Level, motion: FrameMotion, active: NDArray[np.int64], steps: int, unknowns: ArrayF64 | None = None
+) -> FrameMotion:
+    """Run Levenberg-Marquardt over the ``active`` numbers from ``motion``.
+
+    ``unknowns`` [A, U] are the combinations of the active numbers that may change; None: all of them.
+    """
     vector, cost, damping = motion.vector, level.cost(motion), DAMPING
     for _ in range(steps):
         matrix, side = level.normal_equations(motion, active)
+        if unknowns is not None:
+            matrix, side = unknowns.T @ matrix @ unknowns, unknowns.T @ side
         diagonal = matrix.diagonal()
         if diagonal.max() <= 0.0:
             break  # nothing to see
         for _ in range(MAX_TRIES):
             damped = matrix + np.diag(damping * diagonal + DAMPING_FLOOR * diagonal.max())
             trial = vector.copy()
-            trial[active] += np.linalg.solve(damped, side)
+            change = np.linalg.solve(damped, side)
+            trial[active] += change if unknowns is None else unknowns @ change
             tried = motion.with_vector(trial)
             if (after := level.cost(tried)) < cost:
                 break

@@ -89,8 +89,8 @@ def normal_equations(
 ) -> None:
     """Write each row's share of the Gauss-Newton equations for the twists of a frame's motion.
 
-    Differences beyond ``outlier`` count linearly (Huber's weights). Without ``curve``, bend and cube are no
-    unknowns.
+    Differences beyond ``outlier`` count linearly (Huber's weights). Without ``curve``, bend and cube are not
+    among the unknowns.
     """
     height, width = observed.shape
     right, bottom = np.float32(width - 1), np.float32(height - 1)
