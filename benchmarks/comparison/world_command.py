@@ -8,7 +8,7 @@ import click
 
 from cleargs.cli.common import parse_size
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.cli.synth import PROTOCOL_HELP, print_capture
+from cleargs.cli.synth import capture_lines
 
 
 @click.command(
@@ -28,7 +28,7 @@ Example:
     help="Cameras that the path through the scene follows: a transforms.json, its folder, or a run. "
     "Without it, the cameras of the run that contains the scene.",
 )
-@click.option("--protocol", default="mixed", show_default=True, help=PROTOCOL_HELP)
+@click.option("--protocol", default="mixed", show_default=True, help="Degradations, as of `cleargs synth`.")
 @click.option(
     "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="Number of frames."
 )
@@ -67,4 +67,5 @@ def world(
         reporter=make_reporter(),
         setup=scene_setup(scene, cameras, frames, width, height),
     )
-    print_capture(out, summary)
+    for line in capture_lines(out, summary):
+        click.echo(line)

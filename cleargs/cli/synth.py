@@ -72,6 +72,11 @@ def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> No
     from cleargs.synth.synthetic_capture import make_capture
 
     summary = make_capture(out, width=size[0], height=size[1], reporter=make_reporter(), **options)
+    answer(as_json, summary, *capture_lines(out, summary))
+
+
+def capture_lines(out: Path, summary: dict[str, Any]) -> list[str]:
+    """Return the sentences on a synthetic capture that was written."""
     frames, width = f"{summary['frames']} frames of {summary['protocol']!r}", summary["width"]
     lines = [f"{frames} in {out}; ground truth in {out / 'truth'}"]
     lines.append(_line("true blur", summary["blur_px"], width))
@@ -82,7 +87,7 @@ def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> No
             f"noise of the given poses, per axis: {noise['rotation_deg']:.2f} degrees and "
             f"{noise['translation']:.4f} world units"
         )
-    answer(as_json, summary, *lines)
+    return lines
 
 
 def _line(what: str, pixels: dict[str, Any], width: int) -> str:
