@@ -85,8 +85,8 @@ def test_all_stages_as_json(shell: Shell, run: Path, truth: Path, tmp_path: Path
 
 
 def test_held_out_frames(shell: Shell, run: Path) -> None:
-    code, out, _ = shell(run, "--stage", "g0", "-v", *FAST)
-    assert code == 0 and "002" in out and "mean of 1" in out
+    code, out, _ = shell(run, "--stage", "g0", *FAST)
+    assert code == 0 and "mean of 1" in out
     assert (run / "eval" / "holdout" / "eval.json").is_file()
 
 

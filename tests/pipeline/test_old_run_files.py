@@ -19,7 +19,13 @@ OLD = (Path(__file__).with_name("old_run.toml")).read_text()
 """The recipe smoke as written by version 0.2.0: 190 settings, with those of a training in three tables."""
 
 
-OTHER_DEFAULTS = ["ingest.camera_model=SIMPLE_RADIAL", "rivr.targets=auto", "g0.formation.pose=off"]
+OTHER_DEFAULTS = [
+    "ingest.camera_model=SIMPLE_RADIAL",
+    "rivr.targets=auto",
+    "g0.formation.pose=off",
+    "g0.formation.unexplained=0.0",
+    "g0.background=[0.0, 0.0, 0.0]",
+]
 """Settings that the recipe had then and has no longer. A run keeps those of its file."""
 
 

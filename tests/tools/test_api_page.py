@@ -13,6 +13,6 @@ def test_page_is_current() -> None:
 
 
 def test_sections_of_a_docstring_become_markdown() -> None:
-    text = section("deblur")
-    assert "**Args**\n\n* `run`: A run with a trained scene.\n* `frame_id`: " in text
-    assert "**Example**\n\n```python\ndeblurred = cg.deblur(" in text and text.rstrip().endswith("```")
+    text = section("evaluate_scene")
+    assert "**Args**\n\n* `scene`: A run, a scene or a PLY file. " in text
+    assert "**Example**\n\n```python\n" in text and text.rstrip().endswith("```")
