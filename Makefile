@@ -14,11 +14,11 @@
 # make browser           install what the browser tests of the report need in addition to Debian's chromium
 # make oracles           install .oracles, npm packages that read exported scenes in the tests
 # make cluster           install .venv-cluster, the Snakemake that runs a sheet on a cluster
-# PyTorch comes as its CPU build, which is much smaller. GPU=1 takes the build for NVIDIA GPUs, TORCH_INDEX=URL another index.
+# TORCH_INDEX=URL gives pip an extra index of packages, for PyTorch's CPU build, which is much smaller.
 
 PYTHON ?= python3
 BIN := .venv/bin
-TORCH_INDEX ?= $(if $(GPU),,https://download.pytorch.org/whl/cpu)
+TORCH_INDEX ?=
 
 # $(call install,ENVIRONMENT,SECTIONS OF requirements.lock,OUR PACKAGE,PACKAGES OF PYTORCH): pip checks the digest of every
 # file, except those of torch, whose builds differ by machine.
