@@ -27,8 +27,8 @@ class Inherited(NamedTuple):
 class Settings(FrozenModel):
     """A table of settings, which also reads the ``run.toml`` of earlier versions.
 
-    Retired settings are the constants of the class and the names in ``RETIRED``. A retired setting is dropped
-    if it has the value that now applies. Otherwise the error says what to set instead.
+    Retired settings are the constants of the class and the names in ``RETIRED``. One is dropped if it has the
+    value that now applies. Otherwise the error says what to set instead.
     """
 
     RETIRED: ClassVar[Mapping[str, Any]] = {}

@@ -30,11 +30,7 @@ NOTHING: _Row = (-1, -1, -1, -1, "")
 
 
 def json_digest(value: Any) -> str:
-    """Return the SHA-256, in hexadecimal, of ``value`` as JSON with sorted keys and no spaces.
-
-    Raises:
-        ValueError: if ``value`` contains NaN or infinities.
-    """
+    """Return the SHA-256 (hex) of ``value`` as JSON with sorted keys; raise ValueError for NaN, infinity."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -65,10 +61,9 @@ def files_under(path: Path) -> dict[str, Path]:
 class DigestMemo:
     """A cache of digests by path, size, inode, mtime and ctime, stored in an SQLite file.
 
-    Any program can set mtime. Only the kernel sets ctime: at every write, and also when mtime is set back.
-
-    The memo only saves time: if its file is damaged, locked or not writable, digests are computed again, and
-    no error is raised. The file is read at the start and written at the end, if its folder exists by then.
+    Any program can set mtime. Only the kernel sets ctime: at every write, and also when mtime is set back. If
+    the file is damaged, locked or not writable, digests are computed again, and no error is raised. It is
+    read at the start and written at the end, if its folder exists by then.
     """
 
     def __init__(self, path: Path) -> None:
@@ -117,17 +112,10 @@ class DigestMemo:
         self._learnt[str(path.absolute())] = NOTHING
 
     def digests_of(self, external: External, *, rehash: bool = False) -> dict[str, str]:
-        """Return the digests of files outside the store.
+        """Return the digests of files outside the store, read even if the memo has them with ``rehash``.
 
-        Args:
-            external: A file, a folder, or files by name.
-            rehash: Read every file, even if the memo has its digest.
-
-        Returns:
-            ``{"": digest}`` for a file, relative path -> digest for a folder, or name -> digest.
-
-        Raises:
-            InputError: if a file is missing, not regular or not readable, or if its name is not UTF-8.
+        They are ``{"": digest}`` for a file, relative path -> digest for a folder, or name -> digest.
+        InputError is raised if a file is missing, not regular or not readable, or if its name is not UTF-8.
         """
         files = named_files(external)
         for file in files.values():

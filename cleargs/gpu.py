@@ -1,7 +1,6 @@
 """The NVIDIA GPU of this machine: what keeps it from use, its self-test, and the device that follows.
 
-Nothing here imports torch, which takes seconds. The self-test runs in a child process with a time limit,
-because a kernel may hang or crash.
+Nothing here imports torch, which takes seconds. A kernel may hang or crash: the self-test is a child process.
 """
 
 from __future__ import annotations

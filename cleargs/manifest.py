@@ -94,10 +94,7 @@ class Manifest(FrozenModel):
         return sum(record.size for record in self.files.values())
 
     def under(self, path: str) -> dict[str, str]:
-        """Return the digests of the file or folder ``path``, as name in the folder ("" for a file) -> digest.
-
-        The result is empty if there is no such file or folder.
-        """
+        """Return the digests of the file or folder ``path``: name in the folder ("" for a file) -> digest."""
         if path in self.files:
             return {"": self.files[path].digest}
         prefix = path.rstrip("/") + "/"
@@ -122,9 +119,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def read_manifest(folder: Path) -> Manifest:
     """Read and check the manifest in ``folder``.
 
-    Raises:
-        FileNotFoundError: if there is none, because the stage is not finished.
-        ValueError: if it is damaged.
+    Raises FileNotFoundError if there is none (the stage is not finished), and ValueError if it is damaged.
     """
     try:
         content = read_json(folder / MANIFEST)
@@ -168,14 +163,10 @@ def published_files(folder: Path) -> dict[str, Path]:
 def damages(
     folder: Path, manifest: Manifest, names: Iterable[str], memo: DigestMemo, *, rehash: bool = False
 ) -> Iterator[str]:
-    """Yield one message per file that differs from its record in ``manifest``.
+    """Yield one message per file in ``names`` (relative paths) that differs from its record in ``manifest``.
 
-    Args:
-        folder: The stage folder.
-        manifest: The manifest of the folder.
-        names: Relative paths of the files to check.
-        memo: Source of digests. A digest that differs is computed again before it is reported.
-        rehash: Read every file, even if ``memo`` has its digest.
+    A digest of ``memo`` that differs is computed again before it is reported. With ``rehash`` every file is
+    read.
     """
     for name in names:
         record, file = manifest.files[name], folder / name

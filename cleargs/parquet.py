@@ -41,8 +41,7 @@ def schema_of(row: type) -> pa.Schema:
 def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:
     """Write ``table`` with exactly ``schema`` to ``path``, atomically. Equal rows give equal bytes.
 
-    Raises:
-        ValueError: if a column is missing or does not fit its type (also pyarrow's ArrowInvalid).
+    Raises ValueError if a column is missing or does not fit its type (also pyarrow's ArrowInvalid).
     """
     table = table.select(schema.names).cast(schema)
     with atomic_path(path) as temporary:
@@ -52,10 +51,8 @@ def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:
 def read_table(path: Path, schema: pa.Schema) -> pa.Table:
     """Read a table that `write_table` wrote, with the columns of ``schema`` in its order.
 
-    A nullable column that the file of an older version lacks is filled with nulls.
-
-    Raises:
-        StoreError: if the file is missing or damaged, or if it lacks another column.
+    A nullable column that the file of an older version lacks is filled with nulls. StoreError is raised if
+    the file is missing or damaged, or if it lacks another column.
     """
     with read_errors(path):
         table = pq.read_table(path)

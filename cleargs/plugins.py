@@ -40,8 +40,7 @@ def package_of(plugin: EntryPoint) -> tuple[str, str]:
 def load_plugin(point: ExtensionPoint, name: str) -> Any:
     """Import the plugin ``name``, and return the object that its entry point refers to.
 
-    Raises:
-        InputError: if no package provides the plugin, or if its import fails.
+    Raises InputError if no package provides the plugin, or if its import fails.
     """
     plugin = plugins(point).get(name)
     if plugin is None:
@@ -60,15 +59,9 @@ def load_plugin(point: ExtensionPoint, name: str) -> Any:
 
 
 def require_known(point: ExtensionPoint, name: str, shipped: Iterable[str]) -> str:
-    """Return ``name`` if it is one of ``shipped`` or an installed plugin.
+    """Return ``name`` if it is one of ``shipped``, the names that ClearGS provides, or an installed plugin.
 
-    Args:
-        point: The extension point.
-        name: The name in the setting.
-        shipped: Names that ClearGS itself provides.
-
-    Raises:
-        ValueError: if ``name`` is unknown. The message suggests a known name.
+    Raises ValueError if it is unknown. The message suggests a known name.
     """
     shipped = tuple(shipped)
     if name in shipped:  # faster: installed packages are not searched

@@ -29,12 +29,9 @@ class Task(Protocol):
         """Report that ``steps`` more steps are done."""
 
     def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
-        """Report the state of the work.
+        """Report the steps done, and a short note to show next to the progress bar, such as a few figures.
 
-        Args:
-            done: Number of steps done so far.
-            note: A short text to show next to the progress bar, for example a few figures.
-            share: Share of the work that is done, if it differs much from the share of the steps.
+        ``share`` is the share of the work that is done, if it differs much from the share of the steps.
         """
 
 

@@ -26,11 +26,7 @@ SCENE = "scene.ply"
 
 
 def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
-    """Return the stage ``chosen``, or the last stage that has a scene.
-
-    Raises:
-        InputError: if there is no such scene.
-    """
+    """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
     done = [name for name in dag.names if (run / name / SCENE).is_file()]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:

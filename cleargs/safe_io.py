@@ -1,7 +1,6 @@
 """Safe reading of untrusted files: only regular files, only up to a size limit, and no control characters.
 
-A FIFO or a device in place of a file could block its reader or never end. A wrong size, count or depth in a
-file could exhaust the memory.
+A FIFO or a device could block its reader or never end. A wrong size, count or depth could exhaust the memory.
 """
 
 from __future__ import annotations
@@ -50,8 +49,7 @@ TOO_DEEP = "it is nested too deeply"
 def open_regular(path: Path) -> BufferedReader:
     """Open the regular file at ``path``, or the one that it links to, for reading.
 
-    Raises:
-        OSError: if the file is missing or not readable, or if it is a folder, a FIFO or a device.
+    Raises OSError if the file is missing or not readable, or if it is a folder, a FIFO or a device.
     """
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "the name contains a zero byte", str(path))
@@ -107,14 +105,10 @@ def cause(error: Exception) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    r"""Replace control, bidirectional and undecodable characters by escapes such as ``\u001b``.
+    r"""Replace control, bidirectional and undecodable characters, except those in ``keep``, by ``\u001b``...
 
     Names come from files: an escape sequence in a name could write to the clipboard, clear the screen or
     forge a line. The escapes are those of JSON, so that escaped JSON is the same document.
-
-    Args:
-        text: The text to print.
-        keep: Characters that are not replaced.
     """
     if text.isascii() and text.isprintable():
         return text

@@ -17,7 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.transforms import rotation_matrices, sh_basis
+from cleargs.splat.transforms import sh_basis
 
 CHUNK = 2_000_000
 """Largest number of (pixel, Gaussian) products in memory at a time."""
@@ -40,6 +40,18 @@ class Splats(NamedTuple):
     colours: Tensor  # [M, 3]
     opacities: Tensor  # [M]
     depths: Tensor  # [M]
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """Return the rotation matrices [N, 3, 3] of quaternions w x y z [N, 4] of any norm (zero: identity)."""
+    unit = torch.nn.functional.normalize(quaternions, dim=-1, eps=constants.QUATERNION_EPSILON)
+    w, x, y, z = unit.unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
 
 
 def project(gaussians: Gaussians, camera: Camera, sh_count: int, antialias: bool) -> Splats:

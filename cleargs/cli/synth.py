@@ -11,8 +11,8 @@ from cleargs.cli.common import json_option, parse_size, print_json
 from cleargs.cli.progress_bars import make_reporter
 
 PROTOCOL_HELP = (
-    "Degradations: sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, gsotm-mb, gsotm-rs, "
-    "gsotm-mb-rs, gsotm-pn, camera or phone."
+    "Degradations: sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, tremor, gsotm-mb, "
+    "gsotm-rs, gsotm-mb-rs, gsotm-pn, camera or phone."
 )
 
 
@@ -22,6 +22,7 @@ Example:
   cleargs synth room --protocol mixed --frames 16 --size 480x270
   cleargs run room -o run                         use the given poses
   cleargs run room -o run --set ingest.poses=sfm  estimate the poses from the images
+  cleargs synth clip --protocol phone --seconds 60 --fps 30 --size 960x540
 
 \b
 Protocols, with mean lengths at a width of 640 px:
@@ -29,6 +30,7 @@ Protocols, with mean lengths at a width of 640 px:
   mixed                                  every other frame blurred, defocused or badly exposed
   gs2e-slight, gs2e-medium, gs2e-severe  motion blur of 6, 12 and 20 px
   gs2e-stretches                         motion blur of 14 px, almost all in groups of 12 frames
+  tremor                                 motion blur of 12 px along bent paths of a hand that holds still
   gsotm-mb, gsotm-rs, gsotm-mb-rs        motion blur of 8 px, rolling shutter of 12 px, or both
   gsotm-pn                               sharp frames with inexact poses
   phone                                  degradations of a phone's video
@@ -42,6 +44,14 @@ Protocols, with mean lengths at a width of 640 px:
 @click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of room and path.")
 @click.option("--video", is_flag=True, help="Also write OUT/capture.mp4.")
+@click.option(
+    "--seconds", type=click.FloatRange(0.1, 600), help="Length of the walk.  [default: 1/6 s per frame]"
+)
+@click.option(
+    "--fps",
+    type=click.FloatRange(1, 120),
+    help="Frame rate of OUT/capture.mp4, which then shows the whole walk; --frames have ground truth.",
+)
 @json_option
 def synth(
     out: Path,
@@ -50,6 +60,8 @@ def synth(
     size: tuple[int, int],
     seed: int,
     video: bool,
+    seconds: float | None,
+    fps: float | None,
     as_json: bool,
 ) -> None:
     """Make a synthetic handheld capture of a procedural room in the new folder OUT.
@@ -68,6 +80,8 @@ def synth(
         seed=seed,
         reporter=make_reporter(),
         video=video,
+        seconds=seconds,
+        fps=fps,
     )
     if as_json:
         print_json(summary)

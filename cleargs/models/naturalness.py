@@ -1,10 +1,9 @@
 """A no-reference score from a few image statistics, without a network.
 
 Luminance that is normalised by its local mean and contrast (MSCN coefficients; Ruderman 1994; Mittal et al.,
-BRISQUE, 2012) has similar statistics in all sharp photographs. Blur increases the correlation of neighbours,
-over-sharpening and ringing make it negative at a distance of a few pixels, noise removes it. All of them
-change the kurtosis. A quadratic function of these statistics predicts LPIPS to the unknown clean image. Its
-coefficients are in ``naturalness.toml``.
+BRISQUE, 2012) has similar statistics in all sharp photographs. Blur, ringing and noise change the correlation
+of neighbours and the kurtosis. A quadratic function of these statistics, with the coefficients in
+``naturalness.toml``, predicts LPIPS to the unknown clean image.
 """
 
 from __future__ import annotations
@@ -70,11 +69,10 @@ class StatisticsScorer:
 
 
 def expected_value(estimate: float) -> float:
-    """Return the expected value of a quantity in [0, 1] from an unbounded estimate with logistic error.
+    """Return E[clip(estimate + error, 0, 1)] for a logistic error, a strictly rising curve between 0 and 1.
 
-    It is E[clip(estimate + error, 0, 1)]: a strictly rising curve between 0 and 1, close to ``estimate``
-    except near the ends. The quadratic is unbounded: for images crisper than its training patches it predicts
-    a negative LPIPS. A clipped prediction would give all of these images the same score.
+    The quadratic is unbounded: for images crisper than its training patches it predicts a negative LPIPS. A
+    clipped prediction would give all of these images the same score.
     """
     below, above = np.logaddexp(0.0, np.array([estimate, estimate - 1.0]) / _ERROR_SCALE)
     return float(_ERROR_SCALE * (below - above))

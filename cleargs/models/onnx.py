@@ -11,7 +11,6 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from io import StringIO
@@ -63,14 +62,9 @@ def runtime_version(device: Device) -> str:
 
 
 def network_device(device: Device, warn: Callable[[str], None]) -> Device:
-    """Return the device on which onnxruntime can run networks, which a trial determines.
+    """Return ``cuda`` if a run on ``device`` can run networks there, which a trial determines, else ``cpu``.
 
-    Args:
-        device: Device of the run.
-        warn: Function that receives a warning if the run uses a GPU but onnxruntime cannot.
-
-    Returns:
-        ``cuda`` if ``device`` is ``cuda`` and onnxruntime's CUDA provider is present and loads, else ``cpu``.
+    ``warn`` receives a warning if the run uses a GPU but onnxruntime cannot.
     """
     if device == "cpu":
         return "cpu"
@@ -89,23 +83,11 @@ def network_device(device: Device, warn: Callable[[str], None]) -> Device:
     return "cuda"
 
 
-@dataclass(frozen=True)
-class TensorInfo:
-    """An input or output of a model."""
-
-    name: str
-    shape: tuple[int | None, ...]  # None: free
-    dtype: str  # element type: ``float``, ``float16``...
-
-
 class OnnxModel:
     """An ONNX file, loaded by onnxruntime. It runs on the CPU if the GPU's provider does not load.
 
-    The file must contain all weights, because the digest does not cover other files.
-
-    Args:
-        path: ONNX file.
-        device: Device to run on, as `network_device` returns it.
+    The file must contain all weights, because the digest does not cover other files. ``device`` is a result
+    of `network_device`.
 
     Raises:
         InputError: The file is missing, refers to other files, or is not a model that onnxruntime can run.
@@ -146,14 +128,19 @@ class OnnxModel:
         self.digest = hashlib.sha256(model).hexdigest()
         """SHA-256 of the file, hexadecimal."""
         self.device: Device = "cuda" if CUDA_PROVIDER in session.get_providers() else "cpu"
-        self.inputs = _describe(session.get_inputs())
-        self.outputs = _describe(session.get_outputs())
         self._session: Any = session
+        self._inputs = session.get_inputs()
+        self.inputs, self.outputs = (
+            [tuple(side if isinstance(side, int) else None for side in argument.shape) for argument in those]
+            for those in (self._inputs, session.get_outputs())
+        )
+        """Shapes; None: free."""
+        self.takes_floats = all(argument.type == "tensor(float)" for argument in self._inputs)
 
     @property
     def takes_batches(self) -> bool:
         """True if `map` runs several items per call: on a GPU, if the first axis of all inputs is free."""
-        return self.device == "cuda" and all(info.shape[:1] == (None,) for info in self.inputs)
+        return self.device == "cuda" and all(shape[:1] == (None,) for shape in self.inputs)
 
     def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
         """Return all outputs for the given inputs, both in the model's order. The method is thread-safe.
@@ -162,7 +149,7 @@ class OnnxModel:
             MemoryError: The computation does not fit into memory.
             StageError: onnxruntime failed for another reason.
         """
-        feeds = {info.name: tensor for info, tensor in zip(self.inputs, tensors, strict=True)}
+        feeds = {info.name: tensor for info, tensor in zip(self._inputs, tensors, strict=True)}
         try:
             outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
         except Exception as error:  # onnxruntime's exceptions have no common base class
@@ -179,12 +166,10 @@ class OnnxModel:
         items: Sequence[NDArray[np.float32]],
         threads: int,
     ) -> Iterator[Any]:
-        """Apply ``function`` to all items, and yield the results in their order.
+        """Apply ``function`` to all items [H, W, C] of one size, and yield the results in their order.
 
-        Args:
-            function: Function that maps a batch [N, H, W, C] to results [N, ...] with one call of `run`.
-            items: Arrays [H, W, C] of the same size.
-            threads: Number of items at the same time on the CPU. On a GPU a batch is as large as fits.
+        ``function`` maps a batch [N, H, W, C] to results [N, ...] with one call of `run`. On the CPU
+        ``threads`` items are processed at the same time, on a GPU as many as fit.
         """
         if self.takes_batches:
             yield from in_batches(function, items)
@@ -196,12 +181,10 @@ class OnnxModel:
 def in_batches(
     function: Callable[[NDArray[np.float32]], NDArray[np.float32]], items: Sequence[NDArray[np.float32]]
 ) -> list[Any]:
-    """Return the results of ``function`` for ``items`` [H, W, ...] of the same size, computed in batches.
+    """Return the results of ``function`` for ``items`` [H, W, ...] of one size, computed in batches.
 
-    If a batch does not fit into the GPU's memory, the batch size is halved.
-
-    Raises:
-        StageError: A single item is too large.
+    The batch size is halved if a batch does not fit into the GPU's memory. StageError is raised if one item
+    does not.
     """
     pixels = items[0].shape[0] * items[0].shape[1]
     size = max(1, BATCH_PIXELS // pixels)
@@ -228,14 +211,3 @@ def _raise_exhausted(path: Path, error: Exception) -> None:
 
 def _reason(error: Exception) -> str:
     return (str(error).strip() or "no reason was given").splitlines()[0]
-
-
-def _describe(arguments: Sequence[Any]) -> tuple[TensorInfo, ...]:
-    return tuple(
-        TensorInfo(
-            name=argument.name,
-            shape=tuple(extent if isinstance(extent, int) else None for extent in argument.shape),
-            dtype=argument.type.removeprefix("tensor(").removesuffix(")"),
-        )
-        for argument in arguments
-    )

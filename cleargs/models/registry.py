@@ -108,11 +108,7 @@ def load_registry() -> tuple[RegistryEntry, ...]:
 
 
 def find_model(name: str) -> RegistryEntry:
-    """Return the model with this name.
-
-    Raises:
-        InputError: There is no such model.
-    """
+    """Return the model with this name. Raise InputError if there is none."""
     models = {model.name: model for model in load_registry()}
     if name not in models:
         raise InputError(f"there is no model {name!r}", hint=f"choose one of {', '.join(models)}")
@@ -146,16 +142,12 @@ def registered(name: str, role: Role) -> RegistryEntry | None:
 
 
 def model_file(spec: str, role: Role) -> Path | None:
-    """Return the file with the weights of an expert or scorer. Its content is not checked (see `verify`).
+    """Return the absolute path of the weights of an expert or scorer, whose content is not checked.
 
     Args:
         spec: Value of the setting: a model of the registry, the path of an ONNX file (it need not exist), or
-            a part of another package.
+            a plugin. For a plugin the result is None: keys of the store contain its package's version.
         role: ``expert`` or ``scorer``.
-
-    Returns:
-        Absolute path, or None for a part of another package. Keys of the store contain that package's version
-        instead of a digest.
 
     Raises:
         InputError: The name is unknown, or the model is not installed.
@@ -190,8 +182,8 @@ def load_network(
         spec: Value of the setting, as in `model_file`.
         role: ``expert`` or ``scorer``.
         device: Device of the network.
-        from_file: Function that loads a file of weights; it also receives the entry of the registry or None.
-            A part of another package is loaded without it.
+        from_file: Function that loads a file; it also receives the registry's entry or None. It is not used
+            for plugins.
 
     Raises:
         InputError: The name is unknown, or the model is not installed or damaged.
@@ -241,8 +233,8 @@ def read_receipt(model: RegistryEntry, directory: Path) -> dict[str, str]:
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file of weights, hexadecimal.
 
-    The digest of a safetensors file covers names, shapes and values of its tensors; it is "" if the file
-    cannot be read. The digest of other files covers their bytes.
+    That of a safetensors file covers names, shapes and values of its tensors; it is "" if the file cannot be
+    read.
     """
     if path.suffix != ".safetensors":
         return bytes_digest(path)

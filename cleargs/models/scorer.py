@@ -1,11 +1,8 @@
 """No-reference image scorers, which rate the quality of an image without the clean image.
 
-RIVR uses two of them: the primary scorer chooses among candidates, the second one breaks near-ties (the paper
-uses MUSIQ and CLIP-IQA). The two scorers that ClearGS includes were trained for these roles.
-
-Both embedded scores are ``100 - 100 x (predicted LPIPS to the unknown clean image)``: a flawless image has
-100, a frame with a blur of 4 to 12 px about 87. Scores of all scorers from `load_scorer` are clipped to 0-100
-and multiplied by the share of the image with information (`information`).
+RIVR uses two: the primary scorer chooses among candidates, the second one breaks near-ties (in the paper
+MUSIQ and CLIP-IQA). The two that ClearGS includes predict ``100 - 100 x LPIPS`` to the unknown clean image: a
+flawless image has 100, a frame with a blur of 4 to 12 px about 87.
 """
 
 from __future__ import annotations
@@ -60,19 +57,16 @@ class Scorer(Protocol):
         """Return the score of an image, 0-100, higher is better.
 
         Args:
-            image: [H, W, 3] float32 sRGB in [0, 1], each side at least 32 pixels.
+            image: [H, W, 3] float32 sRGB in [0, 1], each side at least 32 pixels. InputError is raised for
+                others.
             threads: Number of CPU threads; it does not change any bit of the score.
-
-        Raises:
-            InputError: The image has another shape, type or range.
         """
 
 
 class InformedScorer:
-    """A scorer whose score is clipped to 0-100 and multiplied by the share of the image with information.
+    """A scorer whose score is clipped to 0-100 and multiplied by the share of the image with `information`.
 
-    Black, white and flat images get 0. Clipped parts of an image reduce its score. Scores on other scales,
-    such as opinion scores of MUSIQ and those of a user's model, are clipped, too.
+    Scores on other scales, such as opinion scores of MUSIQ and those of a user's model, are clipped, too.
     """
 
     def __init__(self, scorer: Scorer) -> None:
@@ -93,15 +87,11 @@ class InformedScorer:
 def information(image: ImageF32) -> float:
     """Return the share of an image that is neither flat nor clipped, 0 to 1.
 
-    In flat areas, and in areas clipped to black or white, a scorer has no evidence of the quality. A black
-    frame could get a perfect score.
-
-    Each block of 16 px counts by its unclipped values (fully from one half) and by its contrast (from a
-    standard deviation of 1/2 of an 8-bit step, fully from 3/4). All limits are ramps, so the share is a
-    continuous function of the image. It is close to 1 for normal frames (figures in ``weights/README.md``).
-
-    Args:
-        image: [H, W, 3] float32 sRGB in [0, 1].
+    In flat areas, and in areas clipped to black or white, a scorer has no evidence of the quality: a black
+    frame could get a perfect score. Each block of 16 px counts by its unclipped values (fully from one half)
+    and by its contrast (from a standard deviation of 1/2 of an 8-bit step, fully from 3/4). All limits are
+    ramps, so the share is a continuous function of the image [H, W, 3]. It is close to 1 for normal frames
+    (``weights/README.md``).
     """
     height, width = image.shape[:2]
     padded = np.pad(image, ((0, -height % BLOCK), (0, -width % BLOCK), (0, 0)), mode="symmetric")
@@ -120,9 +110,8 @@ class LearnedScorer:
     Args:
         path: ONNX file.
         name: Name for tables (None: the file name without its extension).
-        tile: Side of tiles whose mean is the score, px. The score then depends little on the size of the
-            image, as LPIPS is a mean over pixels, too. None: the whole image, or tiles of the network's fixed
-            input size.
+        tile: Side of tiles whose mean is the score, px, so that the score depends little on the size of the
+            image. None: the whole image, or tiles of the network's fixed input size.
         device: Device of the network, as `network_device` returns it.
 
     Raises:
@@ -133,12 +122,12 @@ class LearnedScorer:
         self, path: Path, name: str | None = None, tile: int | None = None, device: Device = "cpu"
     ) -> None:
         model = OnnxModel(path, device)
-        shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
+        shape = model.inputs[0] if len(model.inputs) == 1 else ()
         takes_images = len(shape) == 4 and shape[0] in (None, 1) and shape[1] == 3
-        if not takes_images or len(model.outputs[0].shape) > 2:
+        if not takes_images or len(model.outputs[0]) > 2:
             raise InputError(
                 f"{path} does not map an RGB image to one score: "
-                f"it takes {[i.shape for i in model.inputs]} and returns {[o.shape for o in model.outputs]}",
+                f"it takes {model.inputs} and returns {model.outputs}",
                 hint="use a scoring model that takes [N, 3, H, W] and returns one score per image",
             )
         self.name = name or path.stem
@@ -159,23 +148,16 @@ class LearnedScorer:
 class MusiqScorer:
     """MUSIQ (Ke et al., ICCV 2021) from an ONNX file: a transformer on patches of the image at three sizes.
 
-    The network maps the results of `patches` to a score.
-
-    Args:
-        path: ONNX file.
-        device: Device of the network, as `network_device` returns it.
-
-    Raises:
-        InputError: The file is missing or has other inputs.
+    InputError is raised if the file is missing or its inputs are not those of `patches`.
     """
 
     name = "musiq"
 
     def __init__(self, path: Path, device: Device = "cpu") -> None:
         model = OnnxModel(path, device)
-        if [len(info.shape) for info in model.inputs] != [4, 1, 1]:
+        if [len(shape) for shape in model.inputs] != [4, 1, 1]:
             raise InputError(
-                f"{path} is not MUSIQ: its inputs are {[info.shape for info in model.inputs]}",
+                f"{path} is not MUSIQ: its inputs are {model.inputs}",
                 hint=f"{find_model('musiq').install_hint} again",
             )
         self.digest = model.digest
@@ -188,10 +170,7 @@ class MusiqScorer:
 
 
 def patches(image: ImageF32) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
-    """Cut an image into patches for MUSIQ, as pyiqa: at full size and with longer sides of 224 and 384 px.
-
-    Args:
-        image: [H, W, 3] float32 sRGB in [0, 1].
+    """Cut an image [H, W, 3] into patches as pyiqa: at full size and with longer sides of 224 and 384 px.
 
     Returns:
         Patches [N, 3, 32, 32] in [-1, 1], their cells in the position grid [N], and the indices of their
@@ -238,14 +217,9 @@ def _cells(count: int) -> NDArray[np.int64]:
 
 
 def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
-    """Load the scorer that a setting names.
+    """Load the scorer that a setting names: a model of the registry, the path of an ONNX file, or a plugin.
 
-    Args:
-        spec: Value of the setting: a model of the registry, the path of an ONNX file, or a part.
-        device: Device of the network, as `network_device` returns it.
-
-    Raises:
-        InputError: The scorer is unknown, not installed, damaged or unusable.
+    Raises InputError if it is unknown, not installed, damaged or unusable.
     """
 
     def from_file(path: Path, model: RegistryEntry | None) -> Scorer:

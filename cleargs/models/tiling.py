@@ -90,15 +90,12 @@ def map_tiled(
     *,
     fixed: Sides = (None, None),
 ) -> ImageF32:
-    """Apply a function to overlapping tiles of an image, and blend the results.
+    """Apply a function to overlapping tiles of an image, and blend the results to an image [H, W, 3].
 
     Args:
-        function: Function that maps tiles [h, w, 3] of the same size to tiles of that size, in their order.
+        function: Function that maps tiles [h, w, 3] of one size to tiles of that size, in their order.
         image: Image [H, W, 3]. It is padded by reflection at the right and bottom if necessary.
         fixed: Height and width of the tiles if the function requires them.
-
-    Returns:
-        Image [H, W, 3].
     """
     height, width = image.shape[:2]
     rows, columns = plan_axis(height, fixed[0]), plan_axis(width, fixed[1])
@@ -151,13 +148,9 @@ def mean_over_tiles(
     """Return the mean of a function over evenly spaced tiles that cover an image.
 
     Args:
-        function: Function that maps tiles [h, w, 3] of the same size to one number each, in their order.
-        image: Image [H, W, 3].
-        sides: Height and width of a tile (None: the whole side). A smaller image is one tile in that
-            direction.
-
-    Raises:
-        InputError: The image cannot be scored (`require_scorable`).
+        function: Function that maps tiles [h, w, 3] of one size to one number each, in their order.
+        image: Image [H, W, 3]. InputError is raised as by `require_scorable`.
+        sides: Height and width of a tile (None: the whole side), or less where the image is smaller.
     """
     require_scorable(image)
     places = []

@@ -66,8 +66,7 @@ class ShotRenderer(Viewer):
 def kind_of(output: Path) -> Kind:
     """Return the kind of output for a file name: film (.mp4), still (.png, .exr) or folder (FOLDER/%04d.png).
 
-    Raises:
-        InputError: for any other name.
+    Raises InputError for any other name.
     """
     suffix, numbers = output.suffix.lower(), len(_NUMBER.findall(output.name))
     if suffix == ".mp4" and not numbers:
@@ -107,8 +106,8 @@ def write_shots(
         device: cpu or cuda.
 
     Raises:
-        InputError: if there are several shots for one still, or if the size does not fit the codec.
-        StoreError: if the disk is full or not writable.
+        InputError: There are several shots for one still, or the size does not fit the codec.
+        StoreError: The disk is full or not writable.
     """
     kind, camera = kind_of(output), shots[0].camera
     if kind == "still" and len(shots) > 1:

@@ -33,21 +33,18 @@ _UP_WEIGHT = 0.003
 def smooth_path(
     cameras: Sequence[Camera], count: int
 ) -> tuple[ArrayF64, NDArray[np.int64]]:  # [K, 4, 4] world to camera, [K]
-    """Smooth the path of ``cameras``, and divide it into ``count`` poses at equal steps.
+    """Smooth the path of ``cameras`` (in the order of their frames), and return ``count`` poses along it.
 
     The length of a step is the distance, relative to the extent of the path, plus the angle divided by pi, so
     that a rotation without translation takes time too. Positions and quaternions are filtered with a Gaussian
     along the path. The padding mirrors the path through its ends, so that the ends do not move.
 
-    Args:
-        cameras: Cameras in the order of their frames.
-        count: Number of poses.
-
     Returns:
-        The world-to-camera matrices, and for each the index of the nearest camera along the path.
+        The world-to-camera matrices at equal steps, and for each the index of the nearest camera along the
+        path.
 
     Raises:
-        InputError: if the cameras do not move.
+        InputError: The cameras do not move.
     """
     centres = np.stack([camera.centre for camera in cameras])
     quaternions = Rotation.from_matrix([camera.world_to_camera[:3, :3].T for camera in cameras]).as_quat()
@@ -83,11 +80,8 @@ def turntable(cameras: Sequence[Camera], count: int) -> ArrayF64:  # [count, 4, 
     """Return ``count`` poses on a circle around the point that ``cameras`` look at.
 
     The axis is `up_axis`. Radius and height are the medians over the cameras. The path starts near the first
-    camera. It is a full turn in equal steps. If the cameras leave out more than `WIDEST_GAP` of it, the path
-    goes back and forth along the part that they saw, since the scene is empty elsewhere.
-
-    Raises:
-        InputError: if all cameras look in the same direction.
+    camera. It is a full turn, or if the cameras leave out more than `WIDEST_GAP` of it, it goes back and
+    forth along the part that they saw. InputError is raised if all cameras look in the same direction.
     """
     centre = seen_point(cameras)
     up = up_axis(cameras)

@@ -1,7 +1,4 @@
-"""Shots of a run: a still, its camera path, a turntable, or the poses in a file.
-
-The file is a ``cameras.json`` as `cleargs export` writes it, or a ``transforms.json``.
-"""
+"""Shots of a run: a still, its camera path, a turntable, or the poses in a file."""
 
 from __future__ import annotations
 
@@ -115,7 +112,7 @@ def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | 
         world: Coordinates of the file (default: normalised for cameras.json, input for transforms.json).
 
     Raises:
-        InputError: if the file has another form, or if a pose is not a rotation and a translation.
+        InputError: The file has another form, or a pose is not a rotation and a translation.
     """
     try:
         document = read_json(path)

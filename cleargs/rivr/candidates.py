@@ -1,8 +1,8 @@
 """The three candidates of a target frame (the paper's Table "RIVR candidates"), and the choice between them.
 
-The paper's rule needs no reference: the primary scorer decides (MUSIQ in the paper); when the best two of
-its scores are within a margin, the tie-break scorer (CLIP-IQA in the paper) decides among the candidates
-within it. Images are [H, W, 3] float32 sRGB in [0, 1].
+The primary scorer decides (MUSIQ in the paper); when the best two of its scores are within a margin, the
+tie-break scorer decides among the candidates within it (CLIP-IQA in the paper). Images are [H, W, 3] float32
+sRGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -40,10 +40,7 @@ KEPT = "needs no repair"
 def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
     """Return F = clip(R + D - blur_sigma(D)): the render's base with the restored image's fine detail.
 
-    Args:
-        render: R.
-        restored: D.
-        sigma: Standard deviation of the Gaussian, px. Finer detail comes from ``restored``.
+    ``sigma`` is the standard deviation of the Gaussian, px. Finer detail comes from ``restored``.
     """
     detail = restored - gaussian_blur(restored, sigma)  # float64
     return np.clip(render + detail, 0.0, 1.0).astype(np.float32)
@@ -71,15 +68,8 @@ def choose(
 ) -> CandidateChoice:
     """Choose the candidate with the highest primary score; the tie-break decides within ``margin``.
 
-    If tie-break scores are equal, the higher primary score wins, then the order of `CANDIDATES`.
-
-    Args:
-        primary: Score of each candidate, 0-100, higher is better.
-        tiebreak: The same by the tie-break scorer, for the same candidates.
-        margin: Difference of primary scores up to which the tie-break scorer decides.
-
-    Raises:
-        ValueError: A score is not finite.
+    If tie-break scores are equal, the higher primary score wins, then the order of `CANDIDATES`. ValueError
+    is raised if a score is not finite.
     """
     if not np.isfinite([*primary.values(), *tiebreak.values()]).all():
         raise ValueError(f"scores must be finite: primary {dict(primary)}, tie-break {dict(tiebreak)}")
@@ -103,12 +93,7 @@ def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF3
     A blurred or skewed frame differs from a good scene's render by the blur or the skew, and its repair
     removes much of that. In a sharp frame the difference is an error of the scene, and a repair that follows
     it only carries the error into the frame. Scores do not separate the two, since sharpening raises them in
-    both.
-
-    Args:
-        observed: O_t [H, W, 3].
-        restored: D_t, equal to O_t where the frame is masked.
-        render: R_t, likewise.
+    both. D and R equal O where the frame is masked.
     """
     changed, unexplained = (
         float(np.square(image - observed, dtype=np.float64).sum()) for image in (restored, render)
@@ -117,13 +102,8 @@ def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF3
 
 
 def hide_masked(image: ImageF32, observed: ImageF32, mask: np.ndarray | None) -> ImageF32:
-    """Return ``image`` with the observation in its masked pixels.
+    """Return a candidate with the observation O_t where ``mask`` [H, W] is False; None: nothing is masked.
 
     All candidates then agree there, so that masked pixels cannot decide between them.
-
-    Args:
-        image: A candidate [H, W, 3].
-        observed: O_t.
-        mask: [H, W], False where the frame is to be ignored; None if nothing is masked.
     """
     return image if mask is None else np.where(mask[..., None], image, observed)

@@ -76,10 +76,8 @@ def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
 class TrainedScene:
     """A scene on disk, ready to be rendered.
 
-    ``folder`` has ``scene.ply``, ``exposure.parquet`` and ``formation.parquet``.
-
-    Raises:
-        StoreError: One of them is missing or damaged.
+    ``folder`` has ``scene.ply``, ``exposure.parquet`` and ``formation.parquet``; StoreError is raised if one
+    is missing or damaged.
     """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
@@ -144,8 +142,8 @@ class TrainedScene:
     def formed_layers(self, view: TrainingView, factor: float = 1.0) -> dict[str, ImageF32]:
         """Return a raw frame, reduced by ``factor``, without its motion and as the scene explains it.
 
-        They are called as in an EXR, ``deblurred`` and ``explained``. Without a model of the frame there are
-        none.
+        The layers are named as in an EXR, ``deblurred`` and ``explained``. Without a model of the frame there
+        are none.
         """
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
@@ -173,8 +171,8 @@ class TrainedScene:
     def fidelity(self, holdout: Sequence[TrainingView], scorer: Scorer, threads: int) -> Fidelity | None:
         """Return the agreement of the scene with the held-out frames; None without any.
 
-        Raw frames may be blurred and skewed by the camera's motion, and a sharp scene is not wrong because of
-        that. A frame is therefore compared with the render with that frame's motion.
+        A frame is compared with the render with that frame's motion, since a sharp scene is not wrong because
+        raw frames are blurred and skewed by the camera's motion.
         """
         values, scores = [], []
         for view in holdout:
@@ -198,7 +196,7 @@ class TrainedScene:
         repaired: float = 1.0,
         reporter: Reporter,
     ) -> TrainedScene:
-        """Continue the training on raw and repaired views, with Adam's moments.
+        """Continue the training on raw and repaired views, with Adam's moments; return the scene after it.
 
         A finished training is read back. An interrupted one resumes from its checkpoint, which is deleted at
         the end.
@@ -216,9 +214,6 @@ class TrainedScene:
             repaired: Share of the frames that have a repair. The share of the steps is reduced by it, since a
                 few repairs must not be drawn as often as all frames together.
             reporter: Target of the progress.
-
-        Returns:
-            The scene after the training.
         """
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / SCENE).exists():
@@ -263,13 +258,7 @@ def _deblurred(formed: FormedView, render: Render, observed: ImageF32, mask: Mas
 def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected: TrainedScene | None) -> None:
     """Copy the scene, byte for byte, into the stage folder ``out``, with the log of all trainings.
 
-    A rejected scene is stored next to it as ``rejected.ply``.
-
-    Args:
-        scene: The scene to publish.
-        trainings: Folders of the trainings.
-        out: Folder of the stage.
-        rejected: A scene that did harm.
+    A scene that did harm is stored next to it as ``rejected.ply``.
     """
     logs = [read_table(training / LOG, TRAIN) for training in trainings]
     write_table(out / LOG, pa.concat_tables(logs) if logs else TRAIN.empty_table(), TRAIN)
@@ -280,10 +269,7 @@ def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected:
 
 
 def drop_state(training: Path) -> None:
-    """Remove the state of a finished training, which only the last training needs.
-
-    It is three times as large as the scene.
-    """
+    """Remove the state of a finished training (three scenes large). Only the last one is needed."""
     (training / STATE).unlink(missing_ok=True)
 
 

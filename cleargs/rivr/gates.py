@@ -1,8 +1,8 @@
 """Gates that a repair must pass before it supervises: it must agree with the raw frame or with the render.
 
-Blur moves light by a few pixels. It moves neither the content of the frame nor its mean colour. Every block
-of a repair is therefore in the place of the raw frame O_t or of the render R_t, and has the colours of one of
-the two. The scorers of the selection see one image at a time and cannot notice a difference.
+Blur moves light by a few pixels, but neither the content of the frame nor its mean colour. Every block of a
+repair is therefore in the place of the raw frame O_t or of the render R_t, and has the colours of one of the
+two. The scorers of the selection see one image at a time and cannot notice a difference.
 """
 
 from __future__ import annotations
@@ -32,10 +32,7 @@ _AT_REST = 0.8  # see `_lengths`
 
 
 class GateConfig(Settings):
-    """Limits of the disagreement of a repair with both the raw frame and the render.
-
-    Source of the thresholds: measurements in docs/experiments/rivr.md.
-    """
+    """Limits of the disagreement of a repair with both raw frame and render (docs/experiments/rivr.md)."""
 
     max_share: float = Field(
         0.1, ge=0.0, le=1.0, description="share of the blocks that may disagree; 1: no repair is refused"
@@ -65,11 +62,7 @@ def rejection_reason(
 
 
 def all_masked(mask: MaskBool | None) -> str | None:
-    """Return the reason to refuse every candidate of a frame; None if one may supervise.
-
-    Args:
-        mask: [H, W], False where the frame is to be ignored; None if nothing is masked.
-    """
+    """Return the reason to refuse every candidate of a frame if all of its ``mask`` is False, else None."""
     if mask is not None and not mask.any():
         return "every pixel of the frame is masked"
     return None

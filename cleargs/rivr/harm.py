@@ -14,9 +14,9 @@ from cleargs.base_model import Settings
 class HarmConfig(Settings):
     """Margins beyond which a distilled scene is worse than G0 on the frames held out from repair.
 
-    These frames remain in the raw supervision, as for G0. Without them there, G0 would be measured on frames
-    of its training and the distilled scene on unseen ones. PSNR then falls by 2 to 3 dB while the scene gains
-    0.9 dB against the truth (16 frames, 480x270), and no margin can separate harm from that.
+    These frames remain in the raw supervision, as for G0. Otherwise the distilled scene would be measured on
+    unseen frames: PSNR falls by 2 to 3 dB while the scene gains 0.9 dB against the truth (16 frames,
+    480x270), and no margin can separate harm from that.
     """
 
     held_back: float = Field(
@@ -56,11 +56,10 @@ class HarmVerdict:
 def judge_harm(
     frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
 ) -> HarmVerdict:
-    """Compare a distilled scene with G0 on the held-out ``frames``.
+    """Compare a distilled scene with G0 on the held-out ``frames``; without frames there is no harm.
 
-    Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
-    ``score_margin``: repairs may neither bend the scene away from its best observations nor soften it.
-    Without frames there is no harm.
+    Harm is a fall of the mean PSNR or of the mean primary score by more than its margin: repairs may neither
+    bend the scene away from its best observations nor soften it.
     """
     if before is None or after is None:
         return HarmVerdict([], None, None, None, None, harm=None)

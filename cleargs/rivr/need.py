@@ -1,7 +1,7 @@
 """The frames that image formation and RVA leave in need of a repair.
 
-A repair serves what the formation of a frame cannot explain. Candidates are still made in every run, so that
-the decisions about them can be inspected: where few frames are in need, the next in the order fill up.
+Candidates are made in every run, so that the decisions about them can be inspected: where few frames are in
+need, the next in the order fill up.
 """
 
 from __future__ import annotations
@@ -81,10 +81,8 @@ def frames_to_repair(
 ) -> list[int]:
     """Return the frames that every round repairs, by frame_id; never a held-out one.
 
-    Args:
-        which: ``all``; ``degraded``, those whose role is not ``strong``; or ``auto``, those in need.
-        supervision: The frames.
-        formations: Formations from the training before, by frame_id.
+    ``which`` is ``all``; ``degraded``, those whose role is not ``strong``; or ``auto``, those in need by the
+    formations of the training before.
     """
     frames = supervision.candidates
     if which == "auto":

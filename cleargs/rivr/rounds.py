@@ -1,7 +1,7 @@
 """One round of RIVR: every target frame restored, its candidates scored, one of them chosen, all in an EXR.
 
-The EXR is the record of a frame: it holds the candidates and, as attributes, its row of the selection table.
-It appears whole or not at all, so a round that was cut off resumes at the first frame without one.
+The EXR holds the candidates and, as attributes, the frame's row of the selection table. It appears whole or
+not at all, so a round that was cut off resumes at the first frame without one.
 """
 
 from __future__ import annotations
@@ -53,10 +53,7 @@ TRUSTED = 0.5
 
 @dataclass(frozen=True)
 class Rules:
-    """Rules for restoring a frame, making its candidates and choosing one of them.
-
-    Except for the objects and the threads these are fields of the stage's settings.
-    """
+    """Rules for restoring a frame, making its candidates and choosing one of them: fields of the settings."""
 
     expert: Expert
     primary: Scorer
@@ -75,12 +72,7 @@ class Rules:
     def restored(
         self, view: TrainingView, render: ImageF32, scene: TrainedScene
     ) -> tuple[ImageF32, Source, Deblurred | None]:
-        """Restore a frame.
-
-        Args:
-            view: The frame.
-            render: R_t.
-            scene: The motion that it knows of the frame is undone first.
+        """Restore a frame; R_t is ``render``. The motion that ``scene`` knows of it is undone first.
 
         Returns:
             D_t, the kind of image that it was made from, and the deblurred frame if it was made from that.
@@ -144,8 +136,8 @@ def repair(
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
-    All work is on the images as read back from the EXR (half floats, scene-linear), so that a run which
-    resumes from the file has the images that were scored.
+    All work is on the images as read back from the EXR (half floats, scene-linear), so that a resumed run has
+    the images that were scored.
     """
     rendered = scene.render(view)
     restored, source, deblurred = rules.restored(view, rendered, scene)

@@ -18,10 +18,7 @@ SHEET_FRAMES = 6
 
 
 def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) -> None:
-    """Write one line per row: the observation, the same without its motion, and its candidates.
-
-    Candidates have both scores, and the chosen one is marked.
-    """
+    """Write one line per row: observation, the same without its motion, and candidates with their scores."""
     write_rgb(path, contact_sheet([_candidates(row, rivr) for row in rows] or [_nothing()]))
 
 
@@ -33,10 +30,7 @@ def write_before_after_sheet(
     repairs: Mapping[int, Selection],
     rivr: Path,
 ) -> None:
-    """Write one line per view: G0's render, the final render and the observation.
-
-    If any of the views has a repair that was distilled, there is a column for it.
-    """
+    """Write one line per view: G0's render, the final render, the observation and any distilled repair."""
     repaired = any(view.frame_id in repairs for view in views)
     lines = []
     for view in views:

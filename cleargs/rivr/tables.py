@@ -59,9 +59,7 @@ class Selection:
     def layers(self, rivr: Path) -> Mapping[str, Layer]:
         """Return the layers of the frame's EXR, which is below the rivr folder.
 
-        Raises:
-            ValueError: The frame was not tried.
-            StoreError: The EXR is missing or damaged.
+        Raises ValueError if the frame was not tried, and StoreError if the EXR is missing or damaged.
         """
         if self.exr is None:
             raise ValueError(f"frame {self.frame_id} was not tried")
@@ -99,11 +97,7 @@ def write_selection(path: Path, rows: list[Selection]) -> None:
 
 
 def read_selection(path: Path) -> list[Selection]:
-    """Read the rows in their order.
-
-    Raises:
-        StoreError: The table is missing or damaged.
-    """
+    """Read the rows in their order. Raise StoreError if the table is missing or damaged."""
     return [Selection(**row) for row in read_table(path, SELECTION).to_pylist()]
 
 

@@ -1,7 +1,4 @@
-"""The frames of a capture in RIVR and the consolidation.
-
-Those that are repaired are in groups along the trajectory. Others are held out to measure harm by repairs.
-"""
+"""The frames of a capture in RIVR and the consolidation: those to repair, and those that measure harm."""
 
 from __future__ import annotations
 
@@ -39,10 +36,10 @@ class FrameAssessment:
 def select_holdout(frames: Sequence[FrameAssessment], share: float = 0.125) -> list[int]:
     """Select frames that get no repairs and measure harm by the repairs of the others, in order.
 
-    They are a share (at least one; none for 0) of the reliable frames: the best by R - B of each of as many
-    equal parts of the trajectory, or among equals the nearest to the middle of the part. If no frame is
-    reliable, the stand-in set is used. If RVA names neither, there are none. Soft frames are not selected,
-    since they would count every gain in sharpness as a loss.
+    They are a share (at least one; none for 0) of the reliable frames, or of the stand-in set if there are
+    none: the best by R - B of each of as many equal parts of the trajectory, or among equals the nearest to
+    the middle of the part. Soft frames are not selected, since they would count every gain in sharpness as a
+    loss.
     """
     references = [frame for frame in frames if frame.reliable] or [
         frame for frame in frames if frame.stand_in
@@ -74,17 +71,11 @@ class FrameGroup:
 
 
 def trajectory_groups(targets: Sequence[TrainingView], size: int | None, steps: int) -> list[FrameGroup]:
-    """Divide ``targets``, in their order, into the fewest groups of at most ``size`` frames.
+    """Divide ``targets``, in their order, into the fewest groups of at most ``size`` frames (None: one).
 
-    The paper repairs along the trajectory. Repairs of early frames are distilled before later frames are
-    rendered, and may fade while the later ones are distilled, which the consolidation corrects. The
-    distillation of a group is a separate training, in its part of the schedule. Over one of two rounds the
-    rate of the means falls by a fifth, so that the end of the trajectory gets its geometry too.
-
-    Args:
-        targets: Frames to repair.
-        size: Most frames of a group; None for one group. Sizes differ by one at most.
-        steps: Steps of the round, which are shared in proportion to the frames and add up exactly.
+    The paper repairs along the trajectory: repairs of early frames are distilled before later frames are
+    rendered. Sizes differ by one at most. The ``steps`` of the round are shared in proportion to the frames
+    and add up exactly. The distillation of a group is a separate training, in its part of the schedule.
     """
     frames = len(targets)
     count = 1 if size is None else max(1, -(-frames // size))
@@ -126,14 +117,7 @@ class Supervision:
 
 
 def load_supervision(ingest: Path, rva: Path, holdout_share: float) -> Supervision:
-    """Read the finished folders of ingest and rva, without frames that RVA could not score.
-
-    No image is decoded.
-
-    Args:
-        ingest: Folder of ingest.
-        rva: Folder of rva.
-        holdout_share: Share of the reliable frames that measure harm.
+    """Read the finished folders of ingest and rva, without frames that RVA could not score. Decode no image.
 
     Raises:
         StoreError: A table is damaged.

@@ -1,7 +1,7 @@
-"""Scores, roles and weights of frames from their appearance cues.
+"""Scores, roles and weights of frames from their appearance cues; frames are always in trajectory order.
 
 Implements the paper's Appearance Evidence (reliability R, degradation risk B, reliable set A), Supervision
-Assignment and Trajectory Coverage Compensation. Frames are always in trajectory order.
+Assignment and Trajectory Coverage Compensation.
 """
 
 from __future__ import annotations
@@ -102,9 +102,8 @@ def reactivate(
 ) -> Roles:  # [N] a `Rule` where a suppressed frame is reactivated, "" elsewhere
     """Choose suppressed frames that supervise after all, with the reason.
 
-    First each bin without an active frame gets its frame i*_m of the largest gain, as in the paper. Then the
-    frames of largest gain in the whole capture follow, up to ``active_share``. If gains are equal, the
-    earlier frame is chosen.
+    First each bin without an active frame gets its frame of the largest gain, as in the paper. Then the
+    frames of largest gain in the whole capture follow, up to ``active_share``. Ties go to the earlier frame.
     """
     rules = np.full(len(roles), "", dtype=f"<U{max(map(len, Rule))}")
     active = roles != Role.SUPPRESSED

@@ -73,16 +73,9 @@ def assess(
     """Compute scores, geometry, bins, roles and weights of the training frames.
 
     Observations by held-out or unregistered frames are ignored: they count neither in P_rel nor in n_p. An
-    unscored frame is treated like an unregistered one. If the rows of the arguments are permuted, the result
-    is permuted in the same way.
-
-    Args:
-        frame_id: Ids of the training frames.
-        cues: Appearance cues; columns as `tables.CUE_COLUMNS`.
-        poses: One row per frame.
-        observations: Pairs of any frames of the capture.
-        config: With ``enabled`` false all registered frames are strong with weight 1. With ``weighting``
-            "binary" the better ones get weight 1, the others 0. Other results do not change.
+    unscored frame is treated like an unregistered one. A permutation of the arguments' rows permutes the
+    result. With ``config.enabled`` false all registered frames are strong with weight 1. With ``weighting``
+    "binary" the better ones get weight 1, the others 0. Other results do not change.
     """
     R, B = allocation.appearance_scores(cues, config)
     by_id = np.argsort(frame_id, kind="stable")

@@ -1,7 +1,4 @@
-"""Settings of RVA: all numbers of the paper's table tab:rva_params, and choices that the paper leaves open.
-
-The settings of the stage (`cleargs.stages.rva`) inherit them.
-"""
+"""Settings of RVA: the numbers of the paper's table tab:rva_params, and choices that it leaves open."""
 
 from __future__ import annotations
 
@@ -33,8 +30,7 @@ _NOT_IN_KEY = Field(json_schema_extra={"key": False})
 class QwenConfig(Settings):
     """Settings of the evaluator ``qwen3-vl``: a vision-language model on a server or in a local folder.
 
-    The server's API key is not a setting. It comes from the environment (CLEARGS_VLM_API_KEY) and is never
-    written to a file.
+    The server's API key comes from the environment (CLEARGS_VLM_API_KEY) and is never written to a file.
     """
 
     model: str = Field(
@@ -205,10 +201,7 @@ class AssessmentConfig(Settings):
 
 
 def check_base_url(url: str) -> None:
-    """Raise ValueError unless ``url`` is a plain http(s) address.
-
-    The message does not quote the address, since it may contain a password.
-    """
+    """Raise ValueError unless ``url`` is a plain http(s) address. The message quotes no password in it."""
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise ValueError("the server's base_url must start with http:// or https:// and name a host")

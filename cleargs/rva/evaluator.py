@@ -1,7 +1,4 @@
-"""Protocol of the evaluators, which score the appearance of frames, and a cache of results per frame.
-
-With the cache only the new frames are evaluated after frames are added to a capture.
-"""
+"""Protocol of the evaluators, which score the appearance of frames, and a cache of results per frame."""
 
 from __future__ import annotations
 
@@ -37,8 +34,7 @@ class EvaluatedFrame:
 def load_view(view: EvaluatedFrame) -> tuple[ImageU8, MaskU8 | None]:
     """Read the frame [H, W, 3] in sRGB and its mask [H, W].
 
-    Raises:
-        StoreError: if a file is unreadable, or if the mask and the image differ in size.
+    Raises StoreError if a file is unreadable, or if the mask and the image differ in size.
     """
     hint = "run again with --force ingest"
     try:
@@ -75,8 +71,8 @@ class Evaluator(Protocol):
         """Estimate the cues of frames.
 
         Args:
-            views: Frames in trajectory order; neighbours are neighbours in the video. Their images are read
-                one by one, so that memory does not grow with their number.
+            views: Frames in trajectory order. Their images are read one by one, so that memory does not grow
+                with their number.
             threads: Number of threads. The result does not depend on it.
             reporter: Receives the progress, and a warning for each frame that could not be scored.
 
@@ -92,10 +88,7 @@ def label(evaluator: Evaluator) -> str:
 
 @dataclass(frozen=True)
 class ItemCache:
-    """Cache of one row of numbers per frame, as JSON files.
-
-    The name of a file is a digest of everything that determines its row.
-    """
+    """Cache of a row of numbers per frame, as JSON files named by a digest of all that determines the row."""
 
     folder: Path | None
     """Folder of the files; None: no cache."""
@@ -107,10 +100,9 @@ class ItemCache:
     """Range of valid numbers. A file with a number outside it is not used."""
 
     def row(self, view: EvaluatedFrame, make: Callable[[EvaluatedFrame], ArrayF64]) -> ArrayF64:
-        """Return the cached row of ``view``. If there is none, call ``make`` and store its row, atomically.
+        """Return the cached row of ``view``, or call ``make`` and store its row, atomically.
 
-        Raises:
-            OSError: if a file of the frame is unreadable.
+        Raises OSError if a file of the frame is unreadable.
         """
         if self.folder is None:
             return make(view)

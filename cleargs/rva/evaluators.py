@@ -20,9 +20,8 @@ Device = Literal["cpu", "cuda"]
 def check_evaluator(config: EvaluatorConfig) -> None:
     """Check that the evaluator of the settings is available. Load no weights.
 
-    Raises:
-        InputError: if the plugin cannot be loaded, the server does not answer or lacks the model, or the
-            folder does not contain a Qwen3-VL model.
+    Raises InputError if the plugin cannot be loaded, the server does not answer or lacks the model, or the
+    folder does not contain a Qwen3-VL model.
     """
     if config.evaluator == "qwen3-vl":
         _qwen(config.qwen).check()
@@ -42,7 +41,7 @@ def make_evaluator(
         cache: Folder for results of single frames; None: no cache.
 
     Raises:
-        InputError: if the evaluator is unavailable, for example if the address of its server is invalid.
+        InputError: The evaluator is unavailable, for example because the address of its server is invalid.
     """
     if config.evaluator == "statistics":
         from cleargs.rva.statistics import StatisticsEvaluator

@@ -1,7 +1,6 @@
 """Geometric evidence: coverage gain C, pose diversity D, redundancy O and utility G, and trajectory bins.
 
-Source: the paper's Geometric Evidence. Bins divide the trajectory into parts of equal camera motion. The
-centrality Z says how close a frame is to the middle of its bin.
+Source: the paper's Geometric Evidence. The centrality Z says how close a frame is to the middle of its bin.
 """
 
 from __future__ import annotations
@@ -83,8 +82,8 @@ def visibility(
 ) -> sparse.csr_array:  # [N, P] of 0 and 1
     """Return the sets P_i as a sparse matrix, without the observations of other frames.
 
-    Repeated observations count once. Columns are the points in ascending order of id, so that sums over
-    points do not depend on the order of the frames.
+    Repeated observations count once. Columns are ordered by point id, so that sums do not depend on the
+    frames' order.
     """
     kept = np.isin(observer, frame_id)
     points, columns = np.unique(point_id[kept], return_inverse=True)
@@ -114,8 +113,7 @@ def coverage_gain(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # 
 def redundancy(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # [N, P], [N] -> O [N] in [0, 1]
     """Return O_i = max over reference frames j != i of |P_i and P_j| / |P_i or P_j|; 0 without such a j.
 
-    Only pairs that share a point are visited. The cost is the sum over points of observers x reference
-    observers.
+    Only pairs that share a point are visited.
     """
     largest = np.zeros(seen.shape[0])
     size = np.diff(seen.indptr)

@@ -86,18 +86,15 @@ def detail_ratios(
 ) -> ArrayF64:  # [h, w], [h, w] -> [DIRECTIONS]
     """Return the mean over the tiles of u' T(FINE) u / u' T(COARSE) u per direction k pi / DIRECTIONS.
 
-    Failure modes: soft content (shadows, clouds, out-of-focus background) looks like blur; `statistics`
-    therefore compares with neighbouring frames. Dense noise or grain in dark areas looks like detail if
-    `noise_level` misses it.
+    It is about 3 for sharp step edges, up to 9 for fine texture, closer to 1 for stronger blur, and 0 without
+    structure along a direction. Failure modes: soft content (shadows, clouds, out-of-focus background) looks
+    like blur; `statistics` therefore compares with neighbouring frames. Dense noise or grain in dark areas
+    looks like detail if `noise_level` misses it.
 
     Args:
         luminance: Luma, 0 to 255.
         valid: Pixels to measure.
         noise: Standard deviation of the noise, levels of 255. Its energy is subtracted.
-
-    Returns:
-        About 3 for sharp step edges, up to 9 for fine texture, closer to 1 for stronger blur. It is 0 without
-        structure along a direction, since sharpness cannot be verified there.
     """
     inner = erode_valid(valid, _MARGIN)
     share = _tile_means(inner.astype(np.float32))
@@ -203,10 +200,9 @@ def ringing(luminance: PlaneF32, valid: MaskBool, noise: float) -> float:
 
 
 def exposure(luminance: PlaneF32, valid: MaskBool) -> tuple[float, float, float]:
-    """Return exposure statistics of the valid pixels; (0, 1, 0) if there are none.
+    """Return mean luma, share of clipped pixels, and 95th less 5th percentile of luma, all in [0, 1].
 
-    Returns:
-        Mean luma, share of clipped pixels, and the 95th less the 5th percentile of luma, all in [0, 1].
+    They are those of the valid pixels; (0, 1, 0) if there are none.
     """
     levels = luminance[valid]
     if not levels.size:

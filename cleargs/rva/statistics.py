@@ -112,8 +112,7 @@ class StatisticsEvaluator:
     def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
         """Measure all frames and compare them with their neighbours; see `Evaluator.evaluate`.
 
-        Raises:
-            StoreError: if an image is unreadable.
+        Raises StoreError if an image is unreadable.
         """
         if not views:
             return np.zeros((0, 11))
@@ -131,8 +130,7 @@ class StatisticsEvaluator:
 def cues_from_measures(rows: ArrayF64) -> ArrayF64:  # [n, 11] in [0, 1]
     """Return the cues in the order of `tables.CUE_COLUMNS`.
 
-    Args:
-        rows: Rows of `measure` [n, measures], in trajectory order.
+    ``rows`` are those of `measure` [n, measures], in trajectory order.
     """
     m = Measures(rows[:, :DIRECTIONS], *rows[:, DIRECTIONS:].T)
     content = content_detail(m)

@@ -1,8 +1,4 @@
-"""Schemas of the RVA tables.
-
-Both tables contain training frames only, since held-out frames (split ``test``) belong to no set of RVA. Rows
-are in trajectory order, by ``frame_id``.
-"""
+"""Schemas of the RVA tables: training frames only, in trajectory order, by ``frame_id``."""
 
 from __future__ import annotations
 

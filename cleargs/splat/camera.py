@@ -75,12 +75,9 @@ class Camera:
 
 
 def look_at(position: ArrayF64, target: ArrayF64, up: ArrayF64) -> ArrayF64:  # [4, 4] world to camera
-    """Return the pose of a camera without roll (OpenCV axes).
+    """Return the pose of a camera at ``position``, without roll (OpenCV axes).
 
-    Args:
-        position: Position of the camera, [3].
-        target: Point on the optical axis, [3].
-        up: Direction that is up in the image, [3].
+    ``target`` is a point on the optical axis, ``up`` the direction that is up in the image.
     """
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, up)
@@ -100,14 +97,8 @@ def cameras_json(
 ) -> list[dict[str, Any]]:
     """Return the content of ``cameras.json`` of the Inria code, which viewers read next to a PLY.
 
-    Args:
-        cameras: Names and cameras.
-        scale: Scale of the similarity x -> scale rotation x + translation that is applied to the cameras.
-        rotation: Its rotation (None: identity).
-        translation: Its translation (None: zero).
-
-    Returns:
-        One entry per camera, with its centre and its rotation from camera to world.
+    The cameras, with their names, go through the similarity x -> scale rotation x + translation. Each gets
+    one entry, with its centre and its rotation from camera to world.
     """
     turn = np.eye(3) if rotation is None else rotation
     shift = np.zeros(3) if translation is None else translation

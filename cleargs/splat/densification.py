@@ -9,22 +9,30 @@ adds noise to the means of transparent Gaussians. Two rules differ:
 - A drawn Gaussian is split along its longest axis (Deng et al., "Efficient density control", 2024). Two
   copies at the same place would need many steps to separate.
 
-This module has the rules of a refinement on the CPU, as pure functions on numpy arrays. They run on one
-thread, so that results do not depend on the number of threads. The noise is a kernel
-(`Backend.add_position_noise`). A GPU applies the same rules with different random numbers.
+This module has the rules of a refinement, as pure functions on numpy arrays (on one thread, so that results
+do not depend on the number of threads) or on tensors of a GPU: ``xp`` is numpy or torch, whose functions have
+the same names here. The noise is a kernel (`Backend.add_position_noise`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cleargs.types import AnyArray, ArrayF32, ArrayF64
+from cleargs.types import AnyArray
 
-Arrays = dict[str, ArrayF32]
+Arrays = dict[str, Any]
+"""Arrays or tensors by name, float32, first axis N."""
+
+
+class Draws(Protocol):
+    """Source of random numbers, such as `numpy.random.Generator`."""
+
+    def standard_exponential(self, size: int, /) -> Any: ...
+
 
 NOISE_CUT = 0.15
 """Opacity above which the noise is skipped: its factor is below 1e-6."""
@@ -42,11 +50,12 @@ def refine(
     arrays: Arrays,
     moments: Sequence[Arrays],
     *,
-    errors: ArrayF64,  # [N] >= 0
+    errors: Any,  # [N] float64 >= 0
     rate: float,
     budget: int,
     min_opacity: float,
-    rng: np.random.Generator,
+    rng: Draws,
+    xp: Any = np,
 ) -> tuple[Arrays, list[Arrays]]:
     """Split live Gaussians, drawn in proportion to their errors, in `ROUNDS` rounds.
 
@@ -60,6 +69,7 @@ def refine(
         budget: Maximum number of Gaussians after the growth.
         min_opacity: Opacity up to which a Gaussian is dead.
         rng: Source of the draws.
+        xp: The module of the arrays, numpy or torch.
 
     Returns:
         The new parameters and moments.
@@ -67,38 +77,42 @@ def refine(
     running, start = list(moments), len(errors)
     growth = max(0, min(budget, int((1.0 + rate) * start)) - start)
     for done in range(1, ROUNDS + 1):
-        opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
+        opacity = sigmoid(xp.asarray(arrays["logit_opacities"], dtype=xp.float64), xp)
         alive = opacity > min_opacity  # False for NaN
-        weights, dead = np.where(alive, errors, 0.0), np.flatnonzero(~alive)
+        weights, dead = xp.where(alive, errors, 0.0), xp.where(~alive)[0]
         count = len(opacity)
         room = max(0, start + growth * done // ROUNDS - count)
-        chosen = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng)
-        others = _split(arrays, chosen, opacity[chosen], min_opacity)
-        errors = np.concatenate([errors, np.zeros(max(0, len(chosen) - len(dead)))])
-        places = np.concatenate([dead, np.arange(count, len(errors))])[: len(chosen)]
+        chosen = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng, xp)
+        others = _split(arrays, chosen, opacity[chosen], min_opacity, xp)
+        errors = xp.concatenate([errors, xp.zeros_like(errors[: max(0, len(chosen) - len(dead))])])
+        new = xp.arange(count, len(errors), device=errors.device)
+        places = xp.concatenate([dead, new])[: len(chosen)]
         errors[chosen] /= 2
         errors[places] = errors[chosen]
-        arrays = {name: _write_rows(array, places, others[name]) for name, array in arrays.items()}
+        arrays = {name: _write_rows(array, places, others[name], xp) for name, array in arrays.items()}
         for moment in running:
             for array in moment.values():
                 array[chosen] = 0
         running = [
-            {name: _write_rows(array, places, np.zeros_like(others[name])) for name, array in moment.items()}
+            {
+                name: _write_rows(array, places, xp.zeros_like(others[name]), xp)
+                for name, array in moment.items()
+            }
             for moment in running
         ]
     return arrays, running
 
 
-def _write_rows(array: ArrayF32, places: NDArray[np.int64], rows: ArrayF32) -> ArrayF32:
+def _write_rows(array: Any, places: Any, rows: Any, xp: Any) -> Any:
     """Write ``rows`` at ``places`` of ``array``, extended if places are beyond its end."""
-    longer = max(len(array), 1 + int(places.max(initial=-1)))
-    if longer > len(array):
-        array = np.concatenate([array, np.zeros((longer - len(array), *array.shape[1:]), array.dtype)])
+    missing = 1 + int(places.max()) - len(array) if len(places) else 0
+    if missing > 0:
+        array = xp.concatenate([array, xp.zeros_like(array[:missing])])
     array[places] = rows
     return array
 
 
-def sample_once(weights: ArrayF64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def sample_once(weights: Any, count: int, rng: Draws, xp: Any = np) -> Any:  # [N] float64 -> [count] int64
     """Draw indices without replacement, in proportion to ``weights`` [N] >= 0.
 
     At least ``count`` weights must be positive. Source: Efraimidis and Spirakis, "Weighted random sampling
@@ -106,40 +120,40 @@ def sample_once(weights: ArrayF64, count: int, rng: np.random.Generator) -> NDAr
     """
     with np.errstate(divide="ignore"):
         keys = rng.standard_exponential(len(weights)) / weights
-    first: NDArray[np.int64] = np.argsort(keys, kind="stable")[:count]
-    return first
+    return xp.argsort(keys, stable=True)[:count]
 
 
-def _split(arrays: Arrays, chosen: NDArray[np.int64], opacity: ArrayF64, min_opacity: float) -> Arrays:
+def _split(arrays: Arrays, chosen: Any, opacity: Any, min_opacity: float, xp: Any) -> Arrays:
     """Replace the Gaussians ``chosen`` by their first halves in place, and return the second halves.
 
     The opacity of the halves preserves the optical depth, summed along the axis.
     """
     longest = arrays["log_scales"][chosen].argmax(axis=1)
-    axes = rotation_matrices(arrays["rotations"][chosen])[np.arange(len(chosen)), :, longest]
-    away = axes * (SPLIT_FRACTION * np.exp(arrays["log_scales"][chosen, longest]))[:, None]
-    faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / SPLIT_FRACTION), min_opacity, 1.0 - 1e-6)
-    arrays["log_scales"][chosen, longest] += np.float32(math.log(SPLIT_FRACTION))
-    arrays["logit_opacities"][chosen] = np.log(faint) - np.log1p(-faint)
+    axes = rotation_matrices(arrays["rotations"][chosen], xp)
+    axes = axes[xp.arange(len(chosen), device=chosen.device), :, longest]
+    away = axes * (SPLIT_FRACTION * xp.exp(arrays["log_scales"][chosen, longest]))[:, None]
+    faint = xp.clip(1.0 - (1.0 - opacity) ** (0.5 / SPLIT_FRACTION), min_opacity, 1.0 - 1e-6)
+    arrays["log_scales"][chosen, longest] += math.log(SPLIT_FRACTION)
+    arrays["logit_opacities"][chosen] = xp.asarray(xp.log(faint) - xp.log1p(-faint), dtype=xp.float32)
     others = {name: array[chosen] for name, array in arrays.items()}
     arrays["means"][chosen] -= away
     others["means"] += away
     return others
 
 
-def rotation_matrices(quaternions: ArrayF32) -> ArrayF32:
+def rotation_matrices(quaternions: Any, xp: Any = np) -> Any:
     """Return the rotation matrices [N, 3, 3] of quaternions w x y z [N, 4] of any norm (zero: identity)."""
-    norm = np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
-    w, x, y, z = (quaternions / np.maximum(norm, np.float32(1e-12))).T
+    norm = xp.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
+    w, x, y, z = (quaternions / xp.clip(norm, 1e-12, None)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    return xp.stack([xp.stack(row, axis=1) for row in rows], axis=1)
 
 
-def sigmoid(x: AnyArray) -> AnyArray:
+def sigmoid(x: AnyArray, xp: Any = np) -> AnyArray:
     """Return 1 / (1 + exp(-x)) in the type of ``x``, which is clamped to +-80 so that exp stays finite."""
-    result: AnyArray = 1 / (1 + np.exp(-np.clip(x, -80, 80)))
+    result: AnyArray = 1 / (1 + xp.exp(-xp.clip(x, -80, 80)))
     return result

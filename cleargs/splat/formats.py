@@ -32,8 +32,7 @@ _ABOUT_Z = (-1.0, -1.0, 1.0)  # to x left, y up, z forward: glTF, and PLYs in th
 def write_usd(path: Path, scene: Scene) -> None:
     """Write a scene whose y axis is up as ParticleField3DGaussianSplat of OpenUSD, atomically.
 
-    Raises:
-        InputError: OpenUSD 26.03 or later (the extra ``usd``) is not installed.
+    Raises InputError if OpenUSD 26.03 or later (the extra ``usd``) is not installed.
     """
     try:
         from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
@@ -87,8 +86,7 @@ FORMATS: Mapping[str, Format] = {
 def format_of(path: Path) -> str:
     """Return the file extension of ``path`` in `FORMATS`, or that of a format from another package.
 
-    Raises:
-        InputError: The extension is unknown.
+    Raises InputError if the extension is unknown.
     """
     name = path.name.lower()
     for extensions in (FORMATS, external := plugins("formats")):
@@ -138,8 +136,7 @@ def write_scene(
 def padded(scene: Scene, sh_degree: int) -> Scene:
     """Pad the spherical harmonics of a scene with zeros to a degree (the Inria code reads degree 3 only).
 
-    Raises:
-        InputError: The scene has a higher degree.
+    Raises InputError if the scene has a higher degree.
     """
     gaussians, coefficients = scene.gaussians, (sh_degree + 1) ** 2
     if sh_degree < gaussians.sh_degree:

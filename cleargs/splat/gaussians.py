@@ -13,13 +13,11 @@ from cleargs.splat.constants import SH_DEGREES
 
 @dataclass
 class Gaussians:
-    """Parameters of N Gaussians as the optimiser changes them, with the conventions of the Inria PLY.
+    """Parameters of N Gaussians as the optimiser changes them (as in the Inria PLY), or their gradients.
 
     The covariance is R diag(exp(2 log_scales)) Rᵀ with R from the normalised quaternion. The opacity is
     sigmoid(logit_opacities). The colour is max(SH(direction) + 0.5, 0) in sRGB. K, the number of SH
     coefficients per channel, is 1, 4, 9 or 16 (degree 0 to 3).
-
-    The class also holds the gradients of a loss with respect to these parameters.
 
     Raises:
         InputError: The tensors differ in N, precision or device, or have an unexpected shape.

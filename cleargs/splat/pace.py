@@ -1,8 +1,8 @@
 """Pace of this machine: its time for a training iteration, relative to the reference machine.
 
-``python -m cleargs.splat.pace`` prints the milliseconds of processor time that a training iteration takes on
-one thread. `REFERENCE_MS` is the output on the reference machine. The constants of the stages' ``estimate``
-were measured there, too. Measure them together (docs/experiments/speed.md).
+``python -m cleargs.splat.pace`` prints the milliseconds of processor time that an iteration takes on one
+thread. `REFERENCE_MS` is the output on the reference machine, as are the constants of the stages'
+``estimate``. Measure them together (docs/experiments/speed.md).
 """
 
 from __future__ import annotations
@@ -42,13 +42,9 @@ TIMEOUT_S = 300
 
 
 def machine_pace(say: Callable[[str], None] | None = None) -> float:
-    """Return the time of an iteration on this machine, relative to the reference machine.
+    """Return the pace of this machine, greater than 1 for slower machines; 1 if it is unknown.
 
-    Args:
-        say: Function that receives a message before a measurement. None: do not measure, only read the cache.
-
-    Returns:
-        The cached or measured pace, greater than 1 for slower machines; 1 if it is unknown.
+    It is cached or measured. ``say`` receives a message before a measurement. None: only read the cache.
     """
     pace = cached_pace()
     if pace is not None or say is None:
@@ -84,15 +80,9 @@ def random_scene(
 ) -> tuple[Gaussians, Camera]:
     """Return random Gaussians of SH degree 3 in the view of a camera at the origin, and the camera.
 
-    The density in the image is uniform. Opacities are in [0.05, 0.95], depths in [2, 10]. Equal arguments
-    give equal Gaussians.
-
-    Args:
-        count: Number of Gaussians.
-        width: Width of the image, px.
-        height: Height of the image, px.
-        sigma: Median standard deviation of a projected splat, px.
-        seed: Seed of the random numbers.
+    The density in the image of ``width`` x ``height`` px is uniform. Opacities are in [0.05, 0.95], depths in
+    [2, 10]. ``sigma`` is the median standard deviation of a projected splat, px. Equal arguments give equal
+    Gaussians.
     """
     import numpy as np
     import torch
@@ -142,8 +132,7 @@ def _checked(milliseconds: float) -> float:
 def _measure() -> float:
     """Return the processor time of the fastest iteration in milliseconds.
 
-    Other work on the machine can only increase a time, so the fastest iteration is the best estimate. The
-    first iteration compiles the kernels, and is never the fastest.
+    Other work on the machine can only increase a time. The first iteration compiles the kernels.
     """
     import torch
 

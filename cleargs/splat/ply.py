@@ -1,8 +1,6 @@
 """``scene.ply`` in the layout of the Inria code, which most viewers read: binary little endian, float32.
 
-Values are stored before activation: log scales, opacity logits and unnormalised quaternions (w x y z).
-Comments in the header store the anti-aliasing mode and the background, for which the layout has no
-properties.
+Values are stored before activation. Comments in the header store the anti-aliasing mode and the background.
 """
 
 from __future__ import annotations
@@ -55,8 +53,8 @@ def write_ply(path: Path, scene: Scene) -> None:
 def read_ply(path: Path) -> Scene:
     """Read a scene in the Inria layout, with float32 properties in any order.
 
-    Raises:
-        StoreError: The file is missing or truncated, lacks a property, or has a value that is not finite.
+    Raises StoreError if the file is missing or truncated, lacks a property, or has a value that is not
+    finite.
     """
     try:
         with open_regular(path) as file:

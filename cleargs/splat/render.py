@@ -37,13 +37,13 @@ def render(
         antialias: Apply the opacity compensation of Mip-Splatting (Yu et al. 2024).
 
     Returns:
-        Image [H, W, 3], sRGB as the scene stores it, not clamped above 1. Alpha [H, W]. Accumulated depth
-        [H, W]: the sum of weight times camera z, in scene units. Divide it by alpha for a mean.
+        Image [H, W, 3], sRGB as the scene stores it, not clamped above 1. Alpha [H, W]. Accumulated depth [H,
+        W]: the sum of weight times camera z, in scene units. Divide it by alpha for a mean.
 
     Raises:
-        InputError: If there is no back end for the device, the parameters are not float32, or the SH degree
-            is not stored.
-        StageError: If there are more than 2^31 - 1 (tile, splat) pairs, or more than fit in memory.
+        InputError: There is no back end for the device, the parameters are not float32, or the SH degree is
+            not stored.
+        StageError: There are more than 2^31 - 1 (tile, splat) pairs, or more than fit in memory.
     """
     outputs: tuple[Tensor, Tensor, Tensor] = _Rasterise.apply(  # type: ignore[no-untyped-call]  # torch's own
         *gaussians.tensors().values(), camera, background, sh_degree, antialias

@@ -31,14 +31,10 @@ _ZSTD_LEVEL = 12  # as in load-spz.cc
 
 
 def spz(scene: Scene, version: int = 3) -> bytes:
-    """Encode a scene; equal scenes give equal bytes. The format has no background.
+    """Encode a scene in version 3, which most programs read, or 4; equal scenes give equal bytes.
 
-    Args:
-        scene: Scene with the axes of the format: x right, y up, z back.
-        version: Version of the format: 3, which most programs read, or 4.
-
-    Raises:
-        InputError: The scene is too large for fixed-point positions.
+    The scene has the axes of the format: x right, y up, z back. The format has no background. InputError is
+    raised if the scene is too large for fixed-point positions.
     """
     gaussians = scene.gaussians.to("cpu").detach()
     count, coefficients = gaussians.num, gaussians.sh.shape[1]

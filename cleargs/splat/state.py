@@ -36,14 +36,9 @@ def load_state(path: Path, reporter: Reporter) -> dict[str, Tensor] | None:
 
 
 def read_moments(path: Path, gaussians: Gaussians) -> Moments:
-    """Read the moments of Adam from the state of a finished training.
+    """Read the moments of Adam from the ``state.safetensors`` of the training whose scene has ``gaussians``.
 
-    Args:
-        path: The ``state.safetensors`` of the training.
-        gaussians: Scene of the same training, whose shapes the moments must have.
-
-    Raises:
-        StoreError: The file is missing or damaged, or belongs to a different scene.
+    Raises StoreError if the file is missing or damaged, or belongs to a different scene.
     """
     hint = "repeat the stage that wrote it with --force"
     try:

@@ -60,7 +60,7 @@ class TrainLog:
     def recent_psnr(self, done: int) -> float:
         """Return the mean PSNR in dB of the last 50 steps before step ``done`` (NaN if there are none).
 
-        Steps on fully masked frames have an infinite PSNR, and are left out.
+        Steps on fully masked frames, whose PSNR is infinite, are left out.
         """
         recent = self._rows["psnr"][max(0, done - _RECENT) : done]
         recent = recent[np.isfinite(recent)]

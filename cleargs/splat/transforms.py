@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera
-from cleargs.splat.constants import QUATERNION_EPSILON, SH_C0, SH_C1, SH_C2, SH_C3
+from cleargs.splat.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
@@ -56,20 +56,14 @@ def transform_scene(
     rotation: NDArray[np.float64],  # [3, 3]
     translation: NDArray[np.float64],  # [3]
 ) -> Scene:
-    """Apply the similarity x -> scale rotation x + translation to a scene.
+    """Apply the similarity x -> scale rotation x + translation to a scene, which is not changed.
 
     Cameras that are transformed in the same way see the same images. The computation is in float64 and the
     result in float32, like the files. A translation much larger than the scene therefore reduces the
     precision of the means.
 
-    Args:
-        scene: Scene to transform; it is not changed.
-        scale: Positive factor.
-        rotation: Proper rotation (determinant 1).
-        translation: Translation in units of the new world.
-
     Raises:
-        ValueError: The transform is not a similarity.
+        ValueError: The transform is not a similarity: ``scale`` is not positive, or ``rotation`` not proper.
         InputError: The result exceeds the range of float32.
     """
     if (
@@ -102,18 +96,6 @@ def transform_scene(
     return replace(scene, gaussians=transformed)
 
 
-def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Return the rotation matrices [N, 3, 3] of quaternions w x y z [N, 4] of any norm (zero: identity)."""
-    unit = torch.nn.functional.normalize(quaternions, dim=-1, eps=QUATERNION_EPSILON)
-    w, x, y, z = unit.unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, -2)
-
-
 def sh_basis(directions: Tensor, count: int) -> Tensor:
     """Evaluate the first ``count`` real spherical harmonics [N, count] at unit directions [N, 3]."""
     x, y, z = directions.unbind(-1)
@@ -143,15 +125,8 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 def sh_rotation(rotation: Tensor, count: int) -> Tensor:
     """Return the matrix that maps the SH coefficients of a function f to those of d -> f(rotationᵀ d).
 
-    A rotated harmonic is a sum of harmonics of the same degree. The coefficients therefore follow exactly, up
-    to rounding, from the values in enough directions (least squares).
-
-    Args:
-        rotation: Rotation matrix, [3, 3] float64.
-        count: Number of coefficients: 1, 4, 9 or 16.
-
-    Returns:
-        Matrix [count, count] float64.
+    A rotated harmonic is a sum of harmonics of the same degree. The coefficients (1, 4, 9 or 16) therefore
+    follow exactly, up to rounding, from the values in enough directions (least squares, in float64).
     """
     # A Fibonacci sphere: its directions are evenly spread, so the least squares are well conditioned.
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
@@ -180,16 +155,10 @@ def _multiply(first: Tensor, second: Tensor) -> Tensor:
 
 
 def orient_up(first: Camera, up: str) -> dict[str, Any]:
-    """Return the rigid transform from the normalised world (y down) to a world with another up axis.
+    """Return the rigid transform from the normalised world (y down) to a world with another up axis of `UP`.
 
-    In the new world ``first`` is at the origin and looks ahead; its pitch and roll do not affect the up axis.
-
-    Args:
-        first: First camera of the capture.
-        up: Up axis, a key of `UP`.
-
-    Returns:
-        Arguments of `transform_scene`: scale, rotation and translation.
+    In the new world ``first``, the first camera of the capture, is at the origin and looks ahead; its pitch
+    and roll do not affect the up axis. The result holds the arguments of `transform_scene`.
     """
     ahead = first.world_to_camera[2, :3] * [1.0, 0.0, 1.0]
     length = float(np.linalg.norm(ahead))

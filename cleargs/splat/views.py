@@ -47,11 +47,11 @@ def require_views(views: Sequence[TrainingView]) -> None:
 
 
 def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
-    """Return the pixels of a frame and of its repairs that no training sees, True, [H, W].
+    """Return the pixels [H, W] of a frame and of its repairs that no training sees.
 
     They measure the quality of a scene without held-out frames. They form blocks, because the neighbours of a
-    single pixel reveal its colour. The positions are random, with ``frame_id`` as seed. Images with a side of
-    less than two blocks have none.
+    single pixel reveal its colour, at positions with ``frame_id`` as seed. Images with a side of less than
+    two blocks have none.
     """
     unseen = np.zeros((height, width), np.bool_)
     if min(height, width) < 2 * UNSEEN_BLOCK:
@@ -69,16 +69,11 @@ def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
 
 
 class ImageCache:
-    """Cache of decoded images with a memory limit, at one scale at a time.
+    """Cache of decoded images, with a limit of their memory in bytes, at one scale at a time.
 
     Images are stored as uint8, or as float16 if they were float32. Images that do not fit pass through the
     same types, so that results do not depend on the limit. An image that fits stays: replacing the oldest
-    would reduce the hit rate in shuffled epochs.
-
-    Args:
-        limit_bytes: Memory limit of the stored images and masks.
-        device: Device of the images.
-        training: True: masks exclude the `unseen_pixels`.
+    would reduce the hit rate in shuffled epochs. With ``training``, masks exclude the `unseen_pixels`.
     """
 
     def __init__(

@@ -6,6 +6,7 @@ rolling-shutter skew, so that frame quality varies along it. Poses are camera to
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -103,6 +104,14 @@ SHAKE_GAIN = 12.0
 """Factor of the tremor within a stretch, as of a hand in a hurry. A stretched walk has swings only there."""
 STRETCH_EDGE_S = 1 / FPS
 """Seconds over which the shaking rises and falls."""
+SHOT_SECONDS = 1.0
+"""Time between two photographs of somebody who stands nearly still for each."""
+SHOT_BANDS = (((0.3, 2.0), 6), ((4.0, 12.0), 8))
+"""Range in Hz and number of waves of the slow drift and of the tremor of a hand that holds a camera still."""
+SHOT_SPEED = 0.05
+"""Standard deviation of the speed of the drift, and of the tremor, about each axis, radians per second."""
+SURGE_HZ, SURGE_AMPLITUDE = 1.5, 0.8
+"""The tremor swells and fades at about this rate, between 1 - SURGE_AMPLITUDE and 1 + SURGE_AMPLITUDE."""
 
 
 class Hand:
@@ -152,20 +161,58 @@ class Hand:
         return np.asarray((share**2 * (3 - 2 * share)).sum(1))
 
 
+class StillHand:
+    """Rotation of a camera that a hand tries to hold still, for photographs with long exposures.
+
+    A drift below 2 Hz and the physiological tremor of 4 to 12 Hz, which swells and fades. Drift and tremor
+    are the two parts of the camera shake that Gavant et al., "A physiological camera shake model for image
+    stabilization systems" (IEEE Sensors 2011), describe. Within an exposure of a fifth of a second the path
+    is bent, its speed is uneven, and it rests where the directions change.
+    """
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng([seed, Stream.HAND])
+        bands = [np.geomspace(*band, count)[:, None] for band, count in SHOT_BANDS]
+        self._frequencies = [band * rng.uniform(0.92, 1.0, (len(band), 3)) for band in bands]  # Hz
+        self._phases = [rng.uniform(0, 2 * np.pi, (len(band), 3)) for band in bands]
+        self._surge = rng.uniform(0, 2 * np.pi)  # phase, radians
+
+    def turns(self, times: ArrayF64) -> ArrayF64:  # [T]
+        """Return rotation vectors [T, 3] about the camera's axes, radians."""
+        drift, tremor = (
+            (SHOT_SPEED * math.sqrt(2 / len(rates)) / (rates * 2 * np.pi))
+            * np.sin(2 * np.pi * rates * times[:, None, None] + phases)
+            for rates, phases in zip(self._frequencies, self._phases, strict=True)
+        )
+        surge = 1 + SURGE_AMPLITUDE * np.sin(2 * np.pi * SURGE_HZ * times + self._surge)
+        return np.asarray(drift.sum(1) + surge[:, None] * tremor.sum(1), np.float64)
+
+
 class HandheldPath:
     """Pose of the camera at any time of a walk along a course.
 
-    The walk takes ``frames`` frames at `FPS`. For ``stretched`` see `Hand`.
+    The walk takes ``seconds``: ``frames`` frames at `FPS` unless stated otherwise. For ``stretched`` see
+    `Hand`. With ``shots`` the camera stops for each of ``frames`` photographs, in a `StillHand`.
     """
 
-    def __init__(self, course: Course, frames: int, seed: int, *, stretched: bool = False) -> None:
-        self.duration = frames / FPS
+    def __init__(
+        self,
+        course: Course,
+        frames: int,
+        seed: int,
+        *,
+        seconds: float | None = None,
+        stretched: bool = False,
+        shots: bool = False,
+    ) -> None:
+        self.duration = frames / FPS if seconds is None else seconds
         """Duration in seconds."""
-        self.hand = Hand(self.duration, seed, stretched=stretched)
+        self.hand = StillHand(seed) if shots else Hand(self.duration, seed, stretched=stretched)
         self._course = course
-        self._pauses = max(1, round(frames / FRAMES_PER_PAUSE))
+        steps = frames if seconds is None else round(seconds * FPS)
+        self._pauses = frames if shots else max(1, round(steps / FRAMES_PER_PAUSE))
         rng = np.random.default_rng([seed, Stream.WALK])
-        self._phase = rng.uniform(0, 2 * np.pi)  # phase of the pace, radians
+        self._phase = 0.0 if shots else rng.uniform(0, 2 * np.pi)  # phase of the pace, radians
 
     def poses(self, times: ArrayF64) -> ArrayF64:  # [T] seconds
         """Return poses [T, 3, 4], camera to world with OpenCV axes."""
@@ -180,6 +227,6 @@ class HandheldPath:
         return np.asarray(share + PACE_AMPLITUDE / turn * wave, np.float64)
 
 
-def frame_times(frames: int) -> ArrayF64:
-    """Return the middles of the exposures [frames], in seconds."""
-    return np.asarray((np.arange(frames) + 0.5) / FPS, np.float64)
+def frame_times(frames: int, rate: float = FPS) -> ArrayF64:
+    """Return the middles of the exposures [frames], in seconds, of ``rate`` frames per second."""
+    return np.asarray((np.arange(frames) + 0.5) / rate, np.float64)

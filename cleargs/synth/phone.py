@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cleargs.media.colour import LUMA
+from cleargs.media.colour import LUMA, srgb_from_linear
 from cleargs.media.encode import write_video
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.random_streams import Stream
@@ -66,6 +66,35 @@ class Look:
 
 
 PLAIN = Look()
+
+
+def develop(
+    image: ArrayF64,
+    *,
+    stops: float = 0.0,
+    noise: float = 0.0,
+    rng: np.random.Generator | None = None,
+    look: Look = PLAIN,
+) -> ImageU8:
+    """Convert linear light to an 8-bit sRGB image, with exposure error, sensor noise, clipping and look.
+
+    Args:
+        image: Linear light [H, W, 3]; 1 is sensor white.
+        stops: Exposure error.
+        noise: Standard deviation of the noise at mid grey after the exposure error, sRGB units. 70 % of the
+            variance is shot noise, which depends on the signal. The rest is read noise.
+        rng: Generator of the noise; None: no noise.
+        look: Tone curve and sharpening of the camera.
+
+    Returns:
+        RGB [H, W, 3].
+    """
+    image = image * 2.0**stops
+    if rng is not None:
+        mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: converts ``noise`` to linear light
+        shape = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
+        image = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shape
+    return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
 
 
 def phone_look(seed: int) -> Look:

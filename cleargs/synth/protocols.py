@@ -35,7 +35,7 @@ class Protocol:
     blur: float = 0.0
     """Mean length of the motion path in the image, over points and frames; 0: no motion blur."""
     shutter: float = 0.0
-    """Exposure time as a share of the time between frames; replaces ``blur``."""
+    """Exposure time as a share of 1 / `FPS` seconds; replaces ``blur``."""
     skew: float = 0.0
     """Mean displacement between first and last row's poses, over points and frames; 0: global shutter."""
     rotation_noise: float = 0.0
@@ -52,6 +52,8 @@ class Protocol:
     """JPEG quality; None for lossless PNG."""
     stretched: bool = False
     """The hand shakes in stretches of consecutive frames: see `cleargs.synth.path`."""
+    shots: bool = False
+    """Single photographs with long exposures, during which the hand trembles: see `path.StillHand`."""
     phone: bool = False
     """A phone processes the frames, and a balloon moves in the room: see `cleargs.synth.phone`."""
 
@@ -63,6 +65,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "gs2e-medium": Protocol(blur=12),
     "gs2e-severe": Protocol(blur=20),
     "gs2e-stretches": Protocol(blur=14, stretched=True),
+    "tremor": Protocol(blur=12, shots=True),  # lengths as in gs2e-medium, but bent paths
     "gsotm-mb": Protocol(blur=8),
     "gsotm-rs": Protocol(skew=12),
     "gsotm-mb-rs": Protocol(blur=8, skew=12),
@@ -103,7 +106,11 @@ class Fault:
 
 
 def plan_faults(
-    protocol: Protocol, motions: Sequence[SimulatedMotion], luminances: Sequence[float], seed: int
+    protocol: Protocol,
+    motions: Sequence[SimulatedMotion],
+    luminances: Sequence[float],
+    rate: float,
+    seed: int,
 ) -> list[Fault]:
     """Choose the fault of each frame of a walk.
 
@@ -111,6 +118,7 @@ def plan_faults(
         protocol: The protocol of the capture.
         motions: Image motion of each frame.
         luminances: `cleargs.synth.phone.metered_luminance` of each frame; used for automatic exposure.
+        rate: Frames per second.
         seed: Seed of the random faults.
     """
     scale = motions[0].lens.width / REFERENCE_WIDTH
@@ -124,7 +132,7 @@ def plan_faults(
     )
     if not protocol.phone:
         return [Fault(exposure, readout)] * len(motions)
-    gains = auto_exposure(np.array(luminances), 1 / FPS)
+    gains = auto_exposure(np.array(luminances), 1 / rate)
     return [Fault(exposure, readout, stops=float(stops), noise=phone.NOISE) for stops in gains]
 
 

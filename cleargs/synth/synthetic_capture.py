@@ -13,21 +13,31 @@ import pyarrow as pa
 
 from cleargs.errors import InputError
 from cleargs.files import write_json
-from cleargs.media.colour import srgb_from_linear
 from cleargs.media.encode import require_even, write_video
 from cleargs.media.exr import write_depth
 from cleargs.media.image import write_rgb
 from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
+from cleargs.synth.clip import write_clip
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
 from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, distorted, instant_shutter
-from cleargs.synth.path import FPS, HandheldPath, SceneSetup, frame_times
-from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, encode_and_decode, metered_luminance, phone_look
+from cleargs.synth.path import FPS, SHOT_SECONDS, HandheldPath, SceneSetup, frame_times
+from cleargs.synth.phone import (
+    BITS_PER_PIXEL,
+    PLAIN,
+    Look,
+    develop,
+    encode_and_decode,
+    metered_luminance,
+    phone_look,
+)
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan_faults
 from cleargs.synth.raycast import room_setup
-from cleargs.types import ArrayF64, ImageU8
+from cleargs.types import ArrayF64
 
+PATH_POSES = 17
+"""Number of poses of the true path of an exposure in ``truth/frames.parquet``."""
 NEAR_FOCUS = 0.2
 """Focus distance of a defocused frame, as a share of the mean distance: in front of all surfaces."""
 
@@ -46,6 +56,12 @@ FRAMES = pa.schema(
             "mean distance in the image between the poses of first and last row, pixels",
         ),
         column("exposure_s", pa.float64(), "exposure time of a row, seconds; 0: no motion blur"),
+        column(
+            "path",
+            pa.list_(pa.float64()),
+            f"camera to world at {PATH_POSES} even times from the start to the end of the middle row's "
+            "exposure: matrices [3, 4] with OpenCV axes, row by row, one after the other",
+        ),
         column("readout_s", pa.float64(), "time from first to last row, seconds; 0: global shutter"),
         column("shutter_share", pa.float64(), "exposure_s divided by the time between frames"),
         column("tone_contrast", pa.float64(), "contrast of the tone curve, as in phone.Look; 0: none"),
@@ -69,6 +85,8 @@ def make_capture(
     reporter: Reporter,
     setup: SceneSetup | None = None,
     video: bool = False,
+    seconds: float | None = None,
+    fps: float | None = None,
 ) -> dict[str, Any]:
     """Write a capture into a new folder.
 
@@ -90,6 +108,10 @@ def make_capture(
         reporter: Receives the progress.
         setup: World, course and lens for this number and size of frames; None: the room of ``seed``.
         video: Also write ``out/capture.mp4``, which the protocol phone always has.
+        seconds: Length of the walk. The frames are evenly spaced in it. None: `FPS` frames per second, or
+            one per `SHOT_SECONDS` for photographs.
+        fps: Frame rate of the video. It then has more frames than ``out/images``: see `cleargs.synth.clip`.
+            None: the frames of ``out/images``, at their rate.
 
     Returns:
         The contents of ``truth/capture.json``.
@@ -100,9 +122,13 @@ def make_capture(
     rules = find_protocol(protocol)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")
-    if video or rules.phone:
+    if video or fps is not None or rules.phone:
         require_even(width, height)
-    setup = setup or room_setup(frames, width, height, seed)
+    if rules.shots and seconds is None:
+        seconds = frames * SHOT_SECONDS
+    rate = FPS if seconds is None else frames / seconds
+    steps = frames if seconds is None or rules.shots else round(seconds * FPS)
+    setup = setup or room_setup(steps, width, height, seed)
     look = phone_look(seed) if rules.phone else PLAIN
     processing = {
         "tone_contrast": look.contrast,
@@ -112,7 +138,10 @@ def make_capture(
     }
     if not rules.phone:
         setup = replace(setup, film=None)
-    path, times = HandheldPath(setup.course, frames, seed, stretched=rules.stretched), frame_times(frames)
+    path = HandheldPath(
+        setup.course, frames, seed, seconds=seconds, stretched=rules.stretched, shots=rules.shots
+    )
+    times = frame_times(frames, rate)
     poses = path.poses(times)
     rng, count = np.random.default_rng([seed, Stream.NOVEL_POSES]), max(4, frames // 4)
     novel = np.stack([setup.course.novel((number + 0.5) / count, rng) for number in range(count)])
@@ -132,7 +161,7 @@ def make_capture(
             depths.append(float(seen.mean()))
             nearnesses.append(float((1 / seen).mean()))
             task.advance()
-        faults = plan_faults(rules, motions, luminances, seed)
+        faults = plan_faults(rules, motions, luminances, rate, seed)
         images = [f"images/{stem}.{'png' if rules.jpeg is None else 'jpg'}" for stem in stems]
         shots, rows = [], []
         if setup.film is not None:
@@ -144,20 +173,24 @@ def make_capture(
                 light = distorted(light, setup.lens, rules.distortion)
             shots.append(develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
             moving = {"moving_share": float((seen > 0).mean())}
-            rows.append(_row(number, images[number], motion, fault) | processing | moving)
+            rows.append(_row(number, images[number], motion, fault, rate) | processing | moving)
             if setup.film is not None:
                 mask = np.repeat(np.where(seen > 0, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
                 write_rgb(out / "truth" / "moving" / f"{stems[number]}.png", mask)
             task.advance()
         if rules.phone:
-            shots = encode_and_decode(out / "capture.mp4", shots, FPS)
+            shots = encode_and_decode(out / "capture.mp4", shots, rate)
         for image, shot in zip(images, shots, strict=True):
             write_rgb(out / image, shot, quality=rules.jpeg)
         for stem, pose in zip(novel_stems, novel, strict=True):
             _write_sharp(out / "truth" / "novel", stem, setup, pose, look)
             task.advance()
-    if video and not rules.phone:
-        write_video(out / "capture.mp4", shots, FPS)
+    if fps is not None:
+        write_clip(
+            out / "capture.mp4", setup, rules, path, faults, look=look, fps=fps, seed=seed, reporter=reporter
+        )
+    elif video and not rules.phone:
+        write_video(out / "capture.mp4", shots, rate)
     write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), FRAMES)
     for kind, names, exact in (("observed", stems, poses), ("novel", novel_stems, novel)):
         _write_transforms(out / "truth" / kind, setup.lens, [f"images/{name}.png" for name in names], exact)
@@ -171,7 +204,8 @@ def make_capture(
         "frames": frames,
         "width": width,
         "height": height,
-        "fps": FPS,
+        "fps": rate,
+        "video_fps": fps or (rate if video or rules.phone else None),
         "jpeg_quality": rules.jpeg,
         "codec_bits_per_pixel": processing["codec_bits_per_pixel"],
         "moving": setup.film is not None,
@@ -231,36 +265,8 @@ def _write_sharp(folder: Path, stem: str, setup: SceneSetup, pose: ArrayF64, loo
     return light
 
 
-def develop(
-    image: ArrayF64,
-    *,
-    stops: float = 0.0,
-    noise: float = 0.0,
-    rng: np.random.Generator | None = None,
-    look: Look = PLAIN,
-) -> ImageU8:
-    """Convert linear light to an 8-bit sRGB image, with exposure error, sensor noise, clipping and look.
-
-    Args:
-        image: Linear light [H, W, 3]; 1 is sensor white.
-        stops: Exposure error.
-        noise: Standard deviation of the noise at mid grey after the exposure error, sRGB units. 70 % of the
-            variance is shot noise, which depends on the signal. The rest is read noise.
-        rng: Generator of the noise; None: no noise.
-        look: Tone curve and sharpening of the camera.
-
-    Returns:
-        RGB [H, W, 3].
-    """
-    image = image * 2.0**stops
-    if rng is not None:
-        mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: converts ``noise`` to linear light
-        shape = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
-        image = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shape
-    return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
-
-
-def _row(number: int, image: str, motion: SimulatedMotion, fault: Fault) -> dict[str, Any]:
+def _row(number: int, image: str, motion: SimulatedMotion, fault: Fault, rate: float) -> dict[str, Any]:
+    during = motion.time + fault.exposure * np.linspace(-0.5, 0.5, PATH_POSES)
     return {
         "frame_id": number,
         "image": image,
@@ -271,7 +277,8 @@ def _row(number: int, image: str, motion: SimulatedMotion, fault: Fault) -> dict
         "noise": fault.noise,
         "rolling_shutter_px": motion.skew(fault.readout),
         "exposure_s": fault.exposure,
-        "shutter_share": fault.exposure * FPS,
+        "path": motion.path.poses(during).ravel().tolist(),
+        "shutter_share": fault.exposure * rate,
         "readout_s": fault.readout,
     }
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.comparison.choices import ChoiceRow, agreement, apply_exposure
-from cleargs.synth.synthetic_capture import develop
+from cleargs.synth.phone import develop
 
 
 def row(chosen: str, render: float, restored: float, observed: float) -> ChoiceRow:

@@ -20,7 +20,6 @@ from triton.compiler import ASTSource
 
 from cleargs.splat.kernels.cuda import (
     binning,
-    densify,
     elementwise,
     frame_warp,
     gradients,
@@ -33,7 +32,6 @@ F32, F64, I16, I32, I64, U8 = "*fp32", "*fp64", "*i16", "*i32", "*i64", "*u8"
 SCENE = dict.fromkeys(("means", "log_scales", "rotations", "logits", "sh"), F32)
 SIZE = {"width": "i32", "height": "i32"}
 IMAGE = {"image": F32, "target": F32, "height": "i32", "length": "i32"}
-WINDOW = {"ROWS": loss.ROWS, "COLUMNS": loss.COLUMNS}
 FIELDS = dict.fromkeys(("offset", "sweep", "radius"), F32)
 PHOTOGRAPH = {"height": "i32", "width": "i32", "margin": "i32"}
 GRADIENTS = {f"grad_{name}": F32 for name in SCENE}
@@ -49,19 +47,13 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                 **{"splats": F32, "order": I64, "tile_counts": I32, "pair_ends": I64, "pair_starts": I32},
                 **{"pair_tiles": I16, "pair_owners": I32, "n": "i32", **SIZE},
             },
-            {"BLOCK": 32},
-            {"num_warps": 1, **UNFUSED},
-        ),
-        (
-            binning.order_pairs,
-            {"sorted_slots": I64, "pair_owners": I32, "pair_ids": I32, "pair_slots": I32, "pairs": "i32"},
-            {"BLOCK": 1024},
             {},
+            {"num_warps": 1, **UNFUSED},
         ),
         (
             gradients.total,
             {"tile_counts": I32, "pair_starts": I32, "pair_sums": F32, "totals": F64, "n": "i32"},
-            {"COLUMNS": 9, "ROWS": 16, "BLOCK": 16},
+            {"COLUMNS": 9},
             {},
         ),
         (
@@ -71,39 +63,10 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                 **{"size": "i32", "columns": "i32"},
                 **dict.fromkeys(("beta1", "beta2", "epsilon", "correction", "root_correction"), "fp32"),
             },
-            {"BLOCK": elementwise.BLOCK},
+            {},
             {},
         ),
-        (
-            elementwise.map_pixels,
-            {"image": F32, "affine": F32, "output": F32, "pixels": "i32"},
-            {"BLOCK": elementwise.BLOCK},
-            {},
-        ),
-        (
-            elementwise.map_backward,
-            {
-                **dict.fromkeys(("image", "affine", "grad_output", "grad_image"), F32),
-                **{"partials": F64, "pixels": "i32"},
-            },
-            {"BLOCK": elementwise.BLOCK},
-            {},
-        ),
-        (
-            densify.position_noise_kernel,
-            {
-                **{name: kind for name, kind in SCENE.items() if name != "sh"},
-                **{"n": "i32", "seed": "i64", "amount": "fp32", "min_opacity": "fp32", "cut": "fp32"},
-            },
-            {"BLOCK": densify.BLOCK},
-            {},
-        ),
-        (
-            loss.window_maps,
-            {"maps": F32, "sums": F32, "height": "i32", "length": "i32"},
-            WINDOW,
-            {},
-        ),
+        (loss.window_maps, {"maps": F32, "sums": F32, "height": "i32", "length": "i32"}, {}, {}),
     ]
     found += [
         (
@@ -129,16 +92,11 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                 constants,
                 {},
             ),
-            (
-                frame_warp.return_light,
-                {"light": F32, "scale": F32, "sums": I64, **sampled},
-                constants,
-                {},
-            ),
+            (frame_warp.return_light, {"light": F32, "scale": F32, "sums": I64, **sampled}, constants, {}),
         ]
     for masked in (False, True):
         mask = {"mask": U8 if masked else F32}
-        constants = {"HAS_MASK": masked, **WINDOW}
+        constants = {"HAS_MASK": masked}
         found += [
             (loss.window_rows, {**IMAGE, **mask, "sums": F32}, constants, {}),
             (loss.measure, {**IMAGE, **mask, "sums": F32, "maps": F32, "partials": F64}, constants, {}),
@@ -169,7 +127,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                     },
                     **{"n": "i32", **SIZE},
                 },
-                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "BLOCK": 128},
+                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra},
                 UNFUSED,
             ),
             (
@@ -209,7 +167,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                     **{**SCENE, "view": F64, "splats": F32, "tile_counts": I32, "totals": F64, **GRADIENTS},
                     "n": "i32",
                 },
-                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "HAS_DEPTH": extra, "BLOCK": 128},
+                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "HAS_DEPTH": extra},
                 {},
             ),
         ]

@@ -172,7 +172,7 @@ def test_a_stretch_leaves_bins_without_sharp_frames() -> None:
         track_motion(path, float(time), setup.world.depth(pose, setup.lens), setup.lens)
         for time, pose in zip(times, poses, strict=True)
     ]
-    faults = plan_faults(PROTOCOLS["gs2e-stretches"], motions, [1.0] * 96, SEED)
+    faults = plan_faults(PROTOCOLS["gs2e-stretches"], motions, [1.0] * 96, FPS, SEED)
     blur = np.array([motion.blur(fault.exposure) for motion, fault in zip(motions, faults, strict=True)])
     blurred = blur * REFERENCE_WIDTH / WIDTH > UNRELIABLE
     bins = cut_into_bins(cumulative_motion(poses[:, :, 3], poses[:, :, 2], RvaConfig()), 8).index

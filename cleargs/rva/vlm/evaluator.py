@@ -1,7 +1,6 @@
 """Base class of the Qwen3-VL evaluators: it prepares images, caches scores and marks unscored frames.
 
-The model gets each frame reduced to a maximum size, with masked pixels painted grey. Subclasses send the
-prompt to a server or to a local model.
+The model gets each frame reduced to a maximum size, with masked pixels painted grey.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class UnscoredError(Exception):
 class QwenEvaluator(ABC):
     """Evaluator ``qwen3-vl``: scores each frame separately with the model of a subclass.
 
-    Scores are cached as soon as they arrive, one file per frame, so that an interrupted evaluation resumes.
+    Scores are cached as soon as they arrive, so that an interrupted evaluation resumes.
     """
 
     version = QwenConfig.prompt
@@ -55,13 +54,9 @@ class QwenEvaluator(ABC):
     """Number of images that are scored in parallel, each in its thread."""
 
     def __init__(self, config: QwenConfig, *, model: str, identity: str, cache: Path | None) -> None:
-        """Prepare the cache.
+        """Prepare the cache in the folder ``cache`` (None: no cache).
 
-        Args:
-            config: Settings of the evaluator.
-            model: Name of the model.
-            identity: Everything except the image that determines the scores; part of the cache's keys.
-            cache: Folder of the cache; None: no cache.
+        ``identity`` is everything except the image that determines the scores.
         """
         self.name = f"qwen3-vl:{model}:prompt"
         self._config = config
@@ -77,9 +72,8 @@ class QwenEvaluator(ABC):
     def score(self, image: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
         """Return the cues of one image.
 
-        Raises:
-            UnscoredError: if this image gets no scores.
-            StageError, InputError: if no image would get scores.
+        Raises UnscoredError if this image gets no scores, and StageError or InputError if no image would get
+        scores.
         """
 
     def stop(self) -> None:  # noqa: B027
@@ -88,8 +82,7 @@ class QwenEvaluator(ABC):
     def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
         """Score all frames; see `Evaluator.evaluate`. ``threads`` is not used.
 
-        Raises:
-            StageError: if no frame could be scored.
+        Raises StageError if no frame could be scored.
         """
         cues = np.full((len(views), len(CUE_COLUMNS)), np.nan)
         faults: dict[int, str] = {}

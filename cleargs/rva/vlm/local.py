@@ -30,10 +30,7 @@ class QwenFolder(QwenEvaluator):
     """Runs the model of a local folder. The model is loaded when the first image is scored."""
 
     def __init__(self, config: QwenConfig, *, device: Literal["cpu", "cuda"], cache: Path | None) -> None:
-        """Identify the model in the cache by the names, sizes and times of its files.
-
-        Hashing gigabytes is left to the stage's key.
-        """
+        """Identify the model in the cache by the names, sizes and times of its files."""
         self._folder = Path(config.model_dir).expanduser().absolute()
         self._device = device
         files = sorted(path for path in self._folder.rglob("*") if path.is_file())
@@ -44,8 +41,7 @@ class QwenFolder(QwenEvaluator):
     def check(self) -> None:
         """Check the extra and the folder without reading weights.
 
-        Raises:
-            InputError: if the extra is not installed, or if the folder is not that of a Qwen3-VL model.
+        Raises InputError if the extra is not installed, or if the folder is not that of a Qwen3-VL model.
         """
         try:
             import llguidance.hf  # noqa: F401
@@ -74,8 +70,7 @@ class QwenFolder(QwenEvaluator):
     def _loaded(self) -> tuple[Any, Any, Any, Any]:
         """The model, its tokenizer, its image processor, and the matcher of the schema.
 
-        Raises:
-            InputError: as `check`, or if the weights cannot be loaded.
+        Raises InputError as `check`, or if the weights cannot be loaded.
         """
         self.check()
         import llguidance

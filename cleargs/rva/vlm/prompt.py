@@ -30,9 +30,8 @@ def prompt_text(*, masked: bool) -> str:
 def reply_schema() -> dict[str, Any]:
     """Return the JSON schema of a reply.
 
-    Scores are an enumeration in steps of 0.05. All constrained decoders support enumerations, but many do not
-    support bounds of numbers. An enumeration also prevents endless digits. Models do not distinguish finer
-    steps.
+    Scores are an enumeration in steps of 0.05, since models do not distinguish finer steps. All constrained
+    decoders support enumerations, but many do not support bounds of numbers.
     """
     score = {"type": "number", "enum": [round(k / 20, 2) for k in range(21)]}
     return {
@@ -50,9 +49,8 @@ class ReplyError(Exception):
 def parse_reply(text: str) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
     """Return the cues in the JSON object of ``text``. Other text around the object is ignored.
 
-    Raises:
-        ReplyError: if there is no object, if it does not match the schema (a missing, unknown or non-numeric
-            value, or one outside [0, 1]), or if several objects differ.
+    Raises ReplyError if there is no object, if several objects differ, or if it does not match the schema (a
+    missing, unknown or non-numeric value, or one outside [0, 1]).
     """
     faults, found = [], set()
     for value in _objects(text.rpartition("</think>")[2]):

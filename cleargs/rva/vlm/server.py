@@ -64,11 +64,7 @@ class QwenServer(QwenEvaluator):
     """Sends chats to ``BASE/chat/completions``."""
 
     def __init__(self, config: QwenConfig, *, seed: int, cache: Path | None) -> None:
-        """Read the address and the key.
-
-        Raises:
-            InputError: if the address or the key is invalid.
-        """
+        """Read the address and the key. Raise InputError if one of them is invalid."""
         identity = json.dumps(["server", config.model, config.max_tokens, seed])
         super().__init__(config, model=config.model, identity=identity, cache=cache)
         self.workers = config.concurrency
@@ -105,11 +101,10 @@ class QwenServer(QwenEvaluator):
         self._stopped.set()
 
     def check(self) -> None:
-        """Ask the server for its list of models.
+        """Ask the server for its list of models; an unreadable or empty list is accepted.
 
-        Raises:
-            InputError: if the server does not answer, refuses the key, or lists models without that of the
-                settings. An unreadable or empty list is accepted.
+        Raises InputError if the server does not answer, refuses the key, or lists models without that of the
+        settings.
         """
         model = self._config.model
         try:
@@ -172,9 +167,8 @@ class QwenServer(QwenEvaluator):
     def _complete(self, body: Mapping[str, Any]) -> str:
         """Return the text of the reply to the chat ``body``.
 
-        Raises:
-            UnscoredError: if this chat gets no reply.
-            StageError: if no chat would get one: wrong key, model or address.
+        Raises UnscoredError if this chat gets no reply, and StageError if no chat would get one: wrong key,
+        model or address.
         """
         pause, tried = self._config.backoff_s, 0
         while True:

@@ -12,10 +12,8 @@ def available_memory(root: Path = Path("/")) -> int:
     """Return the number of bytes that this process can allocate without swapping or being killed.
 
     On Linux this is the kernel's MemAvailable, or less if a control group (a container, a batch job) has less
-    left. On other systems it is the memory of the machine, or 2^62 if that is unknown.
-
-    Args:
-        root: Folder that contains ``proc`` and ``sys``.
+    left. On other systems it is the memory of the machine, or 2^62 if that is unknown. ``root`` contains
+    ``proc`` and ``sys``.
     """
     machine = 2**62
     with suppress(AttributeError, OSError, ValueError):  # Windows has no sysconf, others may lack the names

@@ -25,14 +25,9 @@ UNCHECKED_BYTES = 2**28
 
 
 def sh_count(gaussians: Gaussians, sh_degree: int | None) -> int:
-    """Return the number of SH coefficients per channel that a degree uses.
+    """Return the number of SH coefficients per channel that a degree uses (None: the stored degree).
 
-    Args:
-        gaussians: Gaussians with 1, 4, 9 or 16 coefficients.
-        sh_degree: SH degree from 0 to 3; None for the stored one.
-
-    Raises:
-        InputError: If the degree is negative or above the stored one.
+    Raises InputError if the degree is negative or above the stored one.
     """
     if sh_degree is None:
         return int(gaussians.sh.shape[1])
@@ -152,15 +147,10 @@ class Rasteriser(ABC):
             sh_degree: Largest SH degree in use; None for the stored one.
             background: Colour behind the Gaussians, sRGB.
             antialias: Apply the opacity compensation of Mip-Splatting.
-            depth: Render the accumulated depth, too.
+            depth: Render the accumulated depth, too; without it the depth of the result is None.
 
         Returns:
-            Image, alpha and depth as `cleargs.splat.render.render` returns them; the depth is None without
-            ``depth``.
-
-        Raises:
-            InputError: If the parameters are not float32 or the SH degree is not stored.
-            StageError: If there are more than 2^31 - 1 (tile, splat) pairs, or more than fit in memory.
+            Image, alpha and depth as `cleargs.splat.render.render` returns them. It raises the same errors.
         """
         if gaussians.means.dtype != torch.float32:
             raise InputError(
@@ -191,18 +181,13 @@ class Rasteriser(ABC):
         grad_alpha: Tensor | None = None,  # [H, W]
         grad_depth: Tensor | None = None,  # [H, W]
     ) -> Gaussians:
-        """Return the gradients of the five parameters of the last ``forward``.
+        """Return the gradients of the parameters from those of the last image, alpha and depth (None: zeros).
 
         Gaussians that are not visible, and SH coefficients above the degree in use, get exactly 0.
 
-        Args:
-            grad_image: Gradient of the loss with respect to the image.
-            grad_alpha: The same for alpha; None for zeros.
-            grad_depth: The same for the accumulated depth; None for zeros.
-
         Raises:
-            RuntimeError: If there was no ``forward`` before.
-            ValueError: If ``grad_image`` does not have the shape of the image.
+            RuntimeError: There was no ``forward`` before.
+            ValueError: ``grad_image`` does not have the shape of the image.
         """
         if self._state is None:
             raise RuntimeError("backward() needs a call of forward() before it")

@@ -2,10 +2,8 @@
 
 The modules follow the data: ``projection`` (parameters to packed splats), ``binning`` (splats to tiles),
 ``rasterise`` (tiles to pixels and back), ``gradients`` (back to the parameters), ``loss``, ``frame_warp``
-(image formation) and ``elementwise`` (the rest). ``pipeline`` runs them on reusable buffers. ``splat_layout``
-names the columns of their arrays. ``simd`` and ``pixel`` are vector types.
-
-Numba sets the folder of its cache when a kernel is defined, so this package configures it first.
+(image formation) and ``elementwise`` (the rest). ``pipeline`` runs them on reusable buffers. Numba sets the
+folder of its cache when a kernel is defined, so this package configures it first.
 """
 
 from cleargs.splat.kernels.cpu.jit import configure_numba

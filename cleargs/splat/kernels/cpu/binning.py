@@ -103,10 +103,10 @@ def pair_ranges(tile_counts: AnyArray, pair_offsets: AnyArray) -> int:
 
 @serial_kernel
 def depth_order(splats: ArrayF32, tile_counts: AnyArray, keys: AnyArray, ids: AnyArray) -> int:
-    """Sort the visible Gaussians by ascending depth, ties by index.
+    """Sort the visible Gaussians by ascending depth, ties by index; return the row of ``ids`` with the order.
 
-    Positive floats sort like their bit patterns, so three passes of 11 bits are a full sort.
-    ``keys`` and ``ids`` are [2, visible] uint32 scratch. Returns the row of ``ids`` that holds the order.
+    Positive floats sort like their bit patterns, so three passes of 11 bits are a full sort. ``keys`` and
+    ``ids`` are [2, visible] uint32 scratch.
     """
     histogram = np.zeros((RADIX_PASSES, RADIX), np.int64)
     mask = np.uint32(RADIX - 1)

@@ -38,9 +38,8 @@ def adam(
 ) -> None:
     """Update ``parameter`` [n] and its moments [n] in place by a step of Adam (Kingma and Ba 2015).
 
-    ``rates`` are the step sizes of one block, divided by 1 - beta1^t; they are the same for every block.
-    ``root_correction`` is sqrt(1 - beta2^t). The block is the work item, so that the arithmetic of an element
-    does not depend on the number of threads.
+    ``rates`` are the step sizes of one block, the work item, divided by 1 - beta1^t; they are the same for
+    every block. ``root_correction`` is sqrt(1 - beta2^t).
     """
     n, block = parameter.shape[0], rates.shape[0]
     for index in prange((n + block - 1) // block):

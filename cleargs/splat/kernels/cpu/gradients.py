@@ -181,17 +181,6 @@ def backpropagate_one(
         grad_means[g, axis] = turned + (towards[axis] - radial * direction[axis]) / distance
 
 
-@device
-def clear_gradients(g: int, outputs: Parameters) -> None:
-    """Set the gradients of a Gaussian that touches no tile to zero."""
-    grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
-    grad_means[g, :] = ZERO
-    grad_log_scales[g, :] = ZERO
-    grad_rotations[g, :] = ZERO
-    grad_logits[g] = ZERO
-    grad_sh[g, :, :] = ZERO
-
-
 @kernel
 def backpropagate(
     parameters: Parameters,
@@ -206,17 +195,22 @@ def backpropagate(
     """Write the gradients of the five parameters, from the pair sums of the rasteriser's backward pass.
 
     The rows ``pair_offsets[g]`` to ``pair_offsets[g + 1]`` of ``pair_sums`` belong to Gaussian ``g``. They
-    are added in order and in float64, so there are no races and the result does not depend on the threads.
+    are added in order and in float64.
     """
     n = splats.shape[0]
+    grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
     for block in prange((n + BLOCK - 1) // BLOCK):
         basis = np.empty(16, np.float32)
         weights = np.empty(16, np.float32)
         sums = np.empty(layout.PAIR_COLUMNS, np.float64)
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             begin, end = pair_offsets[g], pair_offsets[g + 1]
-            if begin == end:
-                clear_gradients(g, outputs)
+            if begin == end:  # it touches no tile
+                grad_means[g, :] = ZERO
+                grad_log_scales[g, :] = ZERO
+                grad_rotations[g, :] = ZERO
+                grad_logits[g] = ZERO
+                grad_sh[g, :, :] = ZERO
                 continue
             sums[:] = 0.0
             for pair in range(begin, end):

@@ -114,47 +114,6 @@ def row_total(values: ArrayF32, length: int) -> float:
     return total
 
 
-@device
-def similarity_row(
-    y: int,
-    image: ArrayF32,
-    target: ArrayF32,
-    counted: ArrayF32,
-    window: ArrayF32,
-    rows: ArrayF32,
-    values: ArrayF32,
-    maps: ArrayF32,
-) -> None:
-    """Write the SSIM of each value of a row into ``values``, and its derivatives into ``maps``."""
-    height, length = image.shape
-    vertical_means(y, image, target, window, rows)
-    for i in range(PAD, length - PAD, LANES):
-        m = n = p = q = r = broadcast(ZERO)
-        for tap in range(TAPS):
-            weight = window[tap]
-            j = i + CHANNELS * (tap - RADIUS)
-            m = m + load(rows, MEAN_X * length + j) * weight
-            n = n + load(rows, MEAN_Y * length + j) * weight
-            p = p + load(rows, MEAN_XX * length + j) * weight
-            q = q + load(rows, MEAN_YY * length + j) * weight
-            r = r + load(rows, MEAN_XY * length + j) * weight
-        mn = m * n
-        squares = m * m + n * n
-        a1 = TWO * mn + C1
-        a2 = TWO * (r - mn) + C2
-        b1 = squares + C1
-        b2 = (p + q - squares) + C2
-        inverse = ONE / (b1 * b2)
-        similarity = a1 * a2 * inverse
-        counts = load(counted, y * length + i)
-        store(values, i, similarity * counts)
-        scale = inverse * counts
-        by_mean = TWO * (n * (a2 - a1) + m * similarity * (b1 - b2)) * scale
-        store(maps, (BY_MEAN * height + y) * length + i, by_mean)
-        store(maps, (BY_SQUARE * height + y) * length + i, ZERO - similarity * b1 * scale)
-        store(maps, (BY_PRODUCT * height + y) * length + i, TWO * a1 * scale)
-
-
 @kernel
 def measure(
     image: ArrayF32,
@@ -176,26 +135,34 @@ def measure(
             difference = load(image, y * length + i) - load(target, y * length + i)
             store(values, i, magnitude(difference))
         row_sums[y, 0] = row_total(values, length)
-        similarity_row(y, image, target, counted, window, rows, values, maps)
+        vertical_means(y, image, target, window, rows)
+        for i in range(PAD, length - PAD, LANES):
+            m = n = p = q = r = broadcast(ZERO)
+            for tap in range(TAPS):
+                weight = window[tap]
+                j = i + CHANNELS * (tap - RADIUS)
+                m = m + load(rows, MEAN_X * length + j) * weight
+                n = n + load(rows, MEAN_Y * length + j) * weight
+                p = p + load(rows, MEAN_XX * length + j) * weight
+                q = q + load(rows, MEAN_YY * length + j) * weight
+                r = r + load(rows, MEAN_XY * length + j) * weight
+            mn = m * n
+            squares = m * m + n * n
+            a1 = TWO * mn + C1
+            a2 = TWO * (r - mn) + C2
+            b1 = squares + C1
+            b2 = (p + q - squares) + C2
+            inverse = ONE / (b1 * b2)
+            similarity = a1 * a2 * inverse
+            counts = load(counted, y * length + i)
+            store(values, i, similarity * counts)
+            scale = inverse * counts
+            by_mean = TWO * (n * (a2 - a1) + m * similarity * (b1 - b2)) * scale
+            store(maps, (BY_MEAN * height + y) * length + i, by_mean)
+            store(maps, (BY_SQUARE * height + y) * length + i, ZERO - similarity * b1 * scale)
+            store(maps, (BY_PRODUCT * height + y) * length + i, TWO * a1 * scale)
         row_sums[y, 1] = row_total(values, length)
         row_sums[y, 2] = row_total(counted[y], length)
-
-
-@device
-def vertical_maps(y: int, maps: ArrayF32, window: ArrayF32, rows: ArrayF32) -> None:
-    """Write the window sums of the three derivative maps over the rows around ``y``."""
-    _, height, length = maps.shape
-    first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
-    for i in range(PAD, length - PAD, LANES):
-        by_mean = by_square = by_product = broadcast(ZERO)
-        for source in range(first, last + 1):
-            weight = window[source - y + RADIUS]
-            by_mean = by_mean + load(maps, (BY_MEAN * height + source) * length + i) * weight
-            by_square = by_square + load(maps, (BY_SQUARE * height + source) * length + i) * weight
-            by_product = by_product + load(maps, (BY_PRODUCT * height + source) * length + i) * weight
-        store(rows, BY_MEAN * length + i, by_mean)
-        store(rows, BY_SQUARE * length + i, by_square)
-        store(rows, BY_PRODUCT * length + i, by_product)
 
 
 @kernel
@@ -215,7 +182,17 @@ def differentiate(
     for y in prange(height):
         rows = np.zeros((3, length), np.float32)
         values = np.empty(length, np.float32)
-        vertical_maps(y, maps, window, rows)
+        first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
+        for i in range(PAD, length - PAD, LANES):
+            by_mean = by_square = by_product = broadcast(ZERO)
+            for source in range(first, last + 1):
+                weight = window[source - y + RADIUS]
+                by_mean = by_mean + load(maps, (BY_MEAN * height + source) * length + i) * weight
+                by_square = by_square + load(maps, (BY_SQUARE * height + source) * length + i) * weight
+                by_product = by_product + load(maps, (BY_PRODUCT * height + source) * length + i) * weight
+            store(rows, BY_MEAN * length + i, by_mean)
+            store(rows, BY_SQUARE * length + i, by_square)
+            store(rows, BY_PRODUCT * length + i, by_product)
         plus, minus, zero = broadcast(l1_scale), broadcast(-l1_scale), broadcast(ZERO)
         for i in range(PAD, length - PAD, LANES):
             by_mean = by_square = by_product = zero

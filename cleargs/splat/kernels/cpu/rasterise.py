@@ -104,8 +104,8 @@ BACKWARD_SIZE = GEOMETRY_BACKWARD + BATCH * GEOMETRY_SIZE
 def _exp2_coefficients() -> tuple[np.float32, ...]:
     """Return the coefficients of the polynomial p of degree 5 with p(t)^8 = 2^t on [-9, 0.16].
 
-    p is fitted to 2^(t/8) by least squares of the relative error at Chebyshev nodes. The relative error of
-    p(t)^8 in float32 is 2e-6.
+    p is fitted by least squares of the relative error, which for p(t)^8 in float32 is 2e-6, at Chebyshev
+    nodes.
     """
     y = 0.5725 * np.cos(np.linspace(0.0, np.pi, 400)) - 0.5525
     relative = np.vander(y, 6, increasing=True) / np.exp2(y)[:, None]

@@ -2,11 +2,8 @@
 
 LLVM does not vectorise the rasteriser's loops by itself (too many possible aliases, short trip counts), which
 would cost a factor of three. ``lanes`` is an LLVM vector: one register of AVX or AVX-512, two of SSE or NEON.
-``mask`` is the result of a comparison.
-
-Sixteen lanes are one row of a tile. If a splat touches both halves of a row, this takes half as many
-instructions as eight lanes. Without AVX-512, sixteen lanes would need two registers, also for splats that
-touch one half.
+``mask`` is the result of a comparison. Sixteen lanes are one row of a tile; without AVX-512 they would need
+two registers, also for splats that touch one half.
 
 Arithmetic (+ - * /) and comparisons (< <= > >=) work between ``lanes`` values, and with float32 scalars on
 either side. Loads and stores take an array and an element offset; bounds are not checked.

@@ -1,8 +1,7 @@
-"""Lists of the splats that touch each tile, in depth order.
+"""Lists of the splats that touch each tile, in depth order, as in the CPU back end's ``binning``.
 
-Depths are sorted once (N keys of 32 bits). Pairs are then listed in that order. A stable sort by tile only
-(keys of 16 bits for up to 32,766 tiles) leaves the pairs of every tile from near to far, ties by index. Both
-sorts are torch's, which are radix sorts on the GPU.
+Depths are sorted once (N keys of 32 bits). Pairs are then listed in that order and sorted by tile (keys of 16
+bits for up to 32,766 tiles). Both sorts are torch's stable ones, which are radix sorts on the GPU.
 """
 
 from __future__ import annotations
@@ -53,11 +52,8 @@ def tile_rows(mean_y, extent_y, height):
 def tile_columns(ellipse, row, width):
     """Return the tiles [begin, end) of one row of tiles that the ellipse alpha >= 1/255 touches.
 
-    ``ellipse`` holds MEAN_X, MEAN_Y, BEND_X, SKEW, BEND_Y, LOG2_OPACITY, EXTENT_Y and EXTENT_X_AT.
-
-    Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave. It is
-    largest at the ellipse's rightmost point, or at the line of the band that is nearest to that point. The
-    left edge is the mirror image.
+    ``ellipse`` holds MEAN_X, MEAN_Y, BEND_X, SKEW, BEND_Y, LOG2_OPACITY, EXTENT_Y and EXTENT_X_AT. The CPU
+    back end's ``tile_columns`` derives the formula.
     """
     mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at = ellipse
     mean = mean_y.to(tl.float64)
@@ -96,24 +92,12 @@ def count_tiles(ellipse, visible, width, height):
 
 
 @triton.jit(do_not_specialize=["n", "width", "height"])
-def list_pairs(
-    splats,
-    order,
-    tile_counts,
-    pair_ends,
-    pair_starts,
-    pair_tiles,
-    pair_owners,
-    n,
-    width,
-    height,
-    BLOCK: tl.constexpr,
-):
+def list_pairs(splats, order, tile_counts, pair_ends, pair_starts, pair_tiles, pair_owners, n, width, height):
     """Store tile and Gaussian of every slot, and each Gaussian's first slot ``pair_starts`` [N] int32.
 
     Lane r handles the Gaussian ``order[r]``, whose slots end before ``pair_ends[r]``.
     """
-    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    rank = tl.program_id(0) * device_layout.LIST_BLOCK + tl.arange(0, device_layout.LIST_BLOCK)
     mask = rank < n
     g = tl.load(order + rank, mask=mask, other=0).to(tl.int32)
     count = tl.load(tile_counts + g, mask=mask, other=0)
@@ -146,16 +130,6 @@ def list_pairs(
         slot += length
 
 
-@triton.jit(do_not_specialize=["pairs"])
-def order_pairs(sorted_slots, pair_owners, pair_ids, pair_slots, pairs, BLOCK: tl.constexpr):
-    """Store the Gaussian and the slot (both int32) of every place, from torch's int64 order of the slots."""
-    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    mask = place < pairs
-    slot = tl.load(sorted_slots + place, mask=mask, other=0)
-    tl.store(pair_ids + place, tl.load(pair_owners + slot, mask=mask, other=0), mask=mask)
-    tl.store(pair_slots + place, slot.to(tl.int32), mask=mask)
-
-
 def tile_starts(sorted_tiles: Tensor, tiles: int) -> Tensor:
     """Return the first place of every tile, and the end: [tiles + 1] int32."""
     numbers = torch.arange(tiles + 1, dtype=sorted_tiles.dtype, device=sorted_tiles.device)
@@ -163,9 +137,6 @@ def tile_starts(sorted_tiles: Tensor, tiles: int) -> Tensor:
 
 
 def chunk_starts(starts: Tensor) -> Tensor:
-    """Return the first chunk of every tile, and the end: [tiles + 1] int32.
-
-    ``starts`` is the first place of every tile, and the end.
-    """
+    """Return the first chunk of every tile, and the end [tiles + 1] int32, from those of the places."""
     chunks = (starts.diff() + (device_layout.CHUNK - 1)) // device_layout.CHUNK
     return torch.nn.functional.pad(chunks.cumsum(0), (1, 0)).to(torch.int32)

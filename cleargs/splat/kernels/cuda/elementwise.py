@@ -1,4 +1,4 @@
-"""Kernels with one pass over numbers or pixels: Adam and affine colour."""
+"""Adam and the affine colour on the GPU."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import triton.language as tl
 from torch import Tensor
 
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
+from cleargs.splat.kernels.cuda import device_layout
+from cleargs.splat.kernels.cuda.device_layout import NUMBERS_BLOCK
 from cleargs.splat.types import Rate
-
-BLOCK = 1024
 
 
 @triton.jit(do_not_specialize=["size", "columns"])
@@ -29,14 +29,15 @@ def adam(
     epsilon,
     correction,
     root_correction,
-    BLOCK: tl.constexpr,
 ):
     """Update ``parameter`` [size] and its moments in place (Kingma and Ba 2015).
 
     Element i has the learning rate ``rates[i % columns]``. ``correction`` is 1 - beta1^t, ``root_correction``
     is sqrt(1 - beta2^t).
     """
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i = tl.program_id(0).to(tl.int64) * device_layout.NUMBERS_BLOCK + tl.arange(
+        0, device_layout.NUMBERS_BLOCK
+    )
     mask = i < size
     g = tl.load(gradient + i, mask=mask, other=0.0)
     m = beta1 * tl.load(first + i, mask=mask, other=0.0) + (1.0 - beta1) * g
@@ -56,79 +57,28 @@ def adam_step(
     size, (beta1, beta2) = parameter.numel(), ADAM_BETAS
     rates = rate if isinstance(rate, Tensor) else torch.full((1,), rate, device=parameter.device)
     rates = rates.to(parameter.device, torch.float32).reshape(-1)
-    adam[(-(-size // BLOCK),)](
-        parameter,
-        gradient,
-        first,
-        second,
-        rates,
-        size,
-        len(rates),
-        beta1,
-        beta2,
-        ADAM_EPSILON,
-        1.0 - beta1**step,
-        math.sqrt(1.0 - beta2**step),
-        BLOCK=BLOCK,
+    corrections = 1.0 - beta1**step, math.sqrt(1.0 - beta2**step)
+    adam[(-(-size // NUMBERS_BLOCK),)](
+        *(parameter, gradient, first, second, rates, size, len(rates)),
+        *(beta1, beta2, ADAM_EPSILON, *corrections),
         num_warps=4,
     )
 
 
-@triton.jit(do_not_specialize=["pixels"])
-def map_pixels(image, affine, output, pixels, BLOCK: tl.constexpr):
-    """Store affine[:, :3] image + affine[:, 3]; images [pixels, 3], affine [3, 4]."""
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = i < pixels
-    red = tl.load(image + i * 3, mask=mask, other=0.0)
-    green = tl.load(image + i * 3 + 1, mask=mask, other=0.0)
-    blue = tl.load(image + i * 3 + 2, mask=mask, other=0.0)
-    for channel in tl.static_range(3):
-        value = tl.load(affine + channel * 4) * red + tl.load(affine + channel * 4 + 1) * green
-        value += tl.load(affine + channel * 4 + 2) * blue + tl.load(affine + channel * 4 + 3)
-        tl.store(output + i * 3 + channel, value, mask=mask)
-
-
-@triton.jit(do_not_specialize=["pixels"])
-def map_backward(image, affine, grad_output, grad_image, partials, pixels, BLOCK: tl.constexpr):
-    """Store affine[:, :3]ᵀ grad_output, and each program's part of dL/d(affine): [programs, 12]."""
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = i < pixels
-    for source in tl.static_range(3):
-        total = tl.zeros([BLOCK], tl.float32)
-        for channel in tl.static_range(3):
-            g = tl.load(grad_output + i * 3 + channel, mask=mask, other=0.0)
-            total += tl.load(affine + channel * 4 + source) * g
-            value = tl.load(image + i * 3 + source, mask=mask, other=0.0)
-            share = tl.sum(g.to(tl.float64) * value.to(tl.float64), axis=0)
-            tl.store(partials + tl.program_id(0) * 12 + channel * 4 + source, share)
-        tl.store(grad_image + i * 3 + source, total, mask=mask)
-    for channel in tl.static_range(3):
-        g = tl.load(grad_output + i * 3 + channel, mask=mask, other=0.0)
-        tl.store(partials + tl.program_id(0) * 12 + channel * 4 + 3, tl.sum(g.to(tl.float64), axis=0))
-
-
-def _on_device(affine: Tensor, image: Tensor) -> Tensor:
-    # Without waiting for the device: the source is read before the call returns.
-    return affine.detach().float().contiguous().to(image.device, non_blocking=True)
-
-
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
     """See ``cleargs.formation.exposure.apply_affine``."""
-    image, affine = image.detach().contiguous(), _on_device(affine, image)
-    output = torch.empty_like(image)
-    pixels = image.numel() // 3
-    map_pixels[(-(-pixels // BLOCK),)](image, affine, output, pixels, BLOCK=BLOCK, num_warps=4)
-    return output
+    affine = _on_device(affine, image)
+    return image.detach() @ affine[:, :3].T + affine[:, 3]
 
 
 def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
     """See ``cleargs.formation.exposure.affine_backward``. Both gradients stay on the device."""
-    image, affine = image.detach().contiguous(), _on_device(affine, image)
-    grad_image = torch.empty_like(image)
-    pixels = image.numel() // 3
-    programs = -(-pixels // BLOCK)
-    partials = torch.empty(programs, 12, dtype=torch.float64, device=image.device)
-    map_backward[(programs,)](
-        image, affine, grad_output.contiguous(), grad_image, partials, pixels, BLOCK=BLOCK, num_warps=4
-    )
-    return grad_image, partials.sum(0).reshape(3, 4)
+    colours = torch.nn.functional.pad(image.detach().double(), (0, 1), value=1.0)  # [H, W, 4]
+    # One channel at a time: torch sums in a fixed order, which a matrix product does not promise.
+    sums = [(grad_output[..., channel, None] * colours).sum(dim=(0, 1)) for channel in range(3)]
+    return grad_output @ _on_device(affine, image)[:, :3], torch.stack(sums)
+
+
+def _on_device(affine: Tensor, image: Tensor) -> Tensor:
+    # Without waiting for the device: the source is read before the call returns.
+    return affine.detach().float().to(image.device, non_blocking=True)

@@ -1,7 +1,6 @@
 """Gradients of the raw parameters, from the rasteriser's sums over pixels.
 
-The chain rule of ``projection``, as in the CPU back end's ``gradients``. It is computed in float64, except
-for the colours.
+The chain rule of ``projection``, as in the CPU back end's ``gradients``, in float64 except for the colours.
 """
 
 from __future__ import annotations
@@ -28,26 +27,17 @@ from cleargs.splat.kernels.cuda.projection import (
 
 
 @triton.jit(do_not_specialize=["n"])
-def total(
-    tile_counts,
-    pair_starts,
-    pair_sums,
-    totals,
-    n,
-    COLUMNS: tl.constexpr,
-    ROWS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
-    """Sum each Gaussian's slots in float64, in their order, ``BLOCK`` at a time: ``totals`` [COLUMNS, N]."""
-    g = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
+def total(tile_counts, pair_starts, pair_sums, totals, n, COLUMNS: tl.constexpr):
+    """Sum each Gaussian's slots in float64, in their order, a block at a time: ``totals`` [COLUMNS, N]."""
+    g = tl.program_id(0) * device_layout.TOTAL_ROWS + tl.arange(0, device_layout.TOTAL_ROWS)
     mask = g < n
     count = tl.load(tile_counts + g, mask=mask, other=0)
     start = tl.load(pair_starts + g, mask=mask, other=0).to(tl.int64)
     longest = tl.max(count, axis=0)
     for column in tl.static_range(COLUMNS):
-        value = tl.zeros([ROWS], tl.float64)
-        for first in range(0, longest, BLOCK):
-            step = first + tl.arange(0, BLOCK)
+        value = tl.zeros_like(start).to(tl.float64)
+        for first in range(0, longest, device_layout.TOTAL_BLOCK):
+            step = first + tl.arange(0, device_layout.TOTAL_BLOCK)
             some = step[None, :] < count[:, None]
             slot = start[:, None] + step[None, :]
             part = tl.load(pair_sums + slot * layout.PAIR_COLUMNS + column, mask=some, other=0.0)
@@ -65,6 +55,13 @@ def quaternion_gradient(q, c0, c1, c2):
         2.0 * (w * (c2[0] - c0[2]) + x * (c0[1] + c1[0]) + z * (c1[2] + c2[1]) - 2.0 * y * (c0[0] + c2[2])),
         2.0 * (w * (c0[1] - c1[0]) + x * (c0[2] + c2[0]) + y * (c1[2] + c2[1]) - 2.0 * z * (c0[0] + c1[1])),
     )
+
+
+@triton.jit
+def store_triple(pointer, triple, some, mask):
+    """Store three numbers as float32; 0 for a Gaussian that is not in ``some``."""
+    for i in tl.static_range(3):
+        tl.store(pointer + i, tl.where(some, triple[i], 0.0).to(tl.float32), mask=mask)
 
 
 @triton.jit
@@ -94,10 +91,9 @@ def backpropagate(
     SH_COUNT: tl.constexpr,
     ANTIALIAS: tl.constexpr,
     HAS_DEPTH: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """Store the gradients of the five parameters. They are exactly 0 for a Gaussian that touches no tile."""
-    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
     mask = g < n
     some = mask & (tl.load(tile_counts + g, mask=mask, other=0) > 0)
     sum_v = sum_of(totals, layout.SUM_V, g, n, some)
@@ -147,9 +143,8 @@ def backpropagate(
     m0 = combine(v0[0], row0, v1[0], row1)
     m1 = combine(v0[1], row0, v1[1], row1)
     m2 = combine(v0[2], row0, v1[2], row1)
-    tl.store(grad_log_scales + g * 3, tl.where(some, dot(m0, axis0), 0.0).to(tl.float32), mask=mask)
-    tl.store(grad_log_scales + g * 3 + 1, tl.where(some, dot(m1, axis1), 0.0).to(tl.float32), mask=mask)
-    tl.store(grad_log_scales + g * 3 + 2, tl.where(some, dot(m2, axis2), 0.0).to(tl.float32), mask=mask)
+    by_scales = (dot(m0, axis0), dot(m1, axis1), dot(m2, axis2))
+    store_triple(grad_log_scales + g * 3, by_scales, some, mask)
     tl.store(grad_logits + g, tl.where(some, grad_logit, 0.0).to(tl.float32), mask=mask)
 
     by_quaternion = quaternion_gradient(quaternion, scaled(sx, m0), scaled(sy, m1), scaled(sz, m2))
@@ -198,9 +193,8 @@ def backpropagate(
     dx, dy, dz = direction[0].to(tl.float32), direction[1].to(tl.float32), direction[2].to(tl.float32)
     basis = sh_basis(dx, dy, dz)
     by_x, by_y, by_d = sh_by_x(dx, dy, dz), sh_by_y(dx, dy, dz), sh_by_z(dx, dy, dz)
-    towards_x = tl.zeros([BLOCK], tl.float32)
-    towards_y = tl.zeros([BLOCK], tl.float32)
-    towards_z = tl.zeros([BLOCK], tl.float32)
+    zero = tl.zeros_like(red)
+    towards_x, towards_y, towards_z = zero, zero, zero
     for i in tl.static_range(SH_STORED):
         at = (g * SH_STORED + i) * 3
         if i < SH_COUNT:
@@ -210,14 +204,9 @@ def backpropagate(
             towards_x += shade * by_x[i]
             towards_y += shade * by_y[i]
             towards_z += shade * by_d[i]
-            tl.store(grad_sh + at, tl.where(some, basis[i] * red, 0.0), mask=mask)
-            tl.store(grad_sh + at + 1, tl.where(some, basis[i] * green, 0.0), mask=mask)
-            tl.store(grad_sh + at + 2, tl.where(some, basis[i] * blue, 0.0), mask=mask)
+            store_triple(grad_sh + at, (basis[i] * red, basis[i] * green, basis[i] * blue), some, mask)
         else:
-            zero = tl.zeros([BLOCK], tl.float32)
-            tl.store(grad_sh + at, zero, mask=mask)
-            tl.store(grad_sh + at + 1, zero, mask=mask)
-            tl.store(grad_sh + at + 2, zero, mask=mask)
+            store_triple(grad_sh + at, (zero, zero, zero), some, mask)
     towards = (towards_x.to(tl.float64), towards_y.to(tl.float64), towards_z.to(tl.float64))
     radial = dot(towards, direction)
     for i in tl.static_range(3):

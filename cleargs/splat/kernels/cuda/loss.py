@@ -18,11 +18,22 @@ from torch import Tensor
 
 from cleargs.splat import constants
 from cleargs.splat.kernels.cuda import device_layout
+from cleargs.splat.kernels.cuda.device_layout import LOSS_COLUMNS, LOSS_ROWS
 from cleargs.splat.kernels.cuda.support import memory_errors
 
-ROWS = 4
-COLUMNS = 128
-"""Rows, and values per row, of one program."""
+
+@triton.jit
+def places(height, length):
+    """Return the rows and the places in them that a program handles, and which are inside the image."""
+    y = tl.program_id(1) * device_layout.LOSS_ROWS + tl.arange(0, device_layout.LOSS_ROWS)[:, None]
+    i = tl.program_id(0) * device_layout.LOSS_COLUMNS + tl.arange(0, device_layout.LOSS_COLUMNS)[None, :]
+    return y, i, (y < height) & (i < length)
+
+
+@triton.jit
+def zeros():
+    shape: tl.constexpr = [device_layout.LOSS_ROWS, device_layout.LOSS_COLUMNS]
+    return tl.zeros(shape, tl.float32)
 
 
 @triton.jit
@@ -35,26 +46,22 @@ def kept(values, mask, y, j, inside, length, HAS_MASK: tl.constexpr):
     return value
 
 
+@triton.jit
+def sum_of_rows(plane, y, i, height, length):
+    """Return the window sums of a plane [H, length] over the rows around y."""
+    total = zeros()
+    for tap in tl.static_range(11):
+        row = y + (tap - 5)
+        inside = (row >= 0) & (row < height) & (i < length)
+        total += tl.load(plane + row * length + i, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+    return total
+
+
 @triton.jit(do_not_specialize=["height", "length"])
-def window_rows(
-    image,
-    target,
-    mask,
-    sums,
-    height,
-    length,
-    HAS_MASK: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
+def window_rows(image, target, mask, sums, height, length, HAS_MASK: tl.constexpr):
     """Store the window sums of x, y, x², y² and xy along the rows: ``sums`` [5, H, length]."""
-    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
-    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
-    mean_x = tl.zeros([ROWS, COLUMNS], tl.float32)
-    mean_y = tl.zeros([ROWS, COLUMNS], tl.float32)
-    mean_xx = tl.zeros([ROWS, COLUMNS], tl.float32)
-    mean_yy = tl.zeros([ROWS, COLUMNS], tl.float32)
-    mean_xy = tl.zeros([ROWS, COLUMNS], tl.float32)
+    y, i, here = places(height, length)
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = zeros(), zeros(), zeros(), zeros(), zeros()
     for tap in tl.static_range(11):
         j = i + 3 * (tap - 5)
         inside = (y < height) & (j >= 0) & (j < length)
@@ -69,7 +76,6 @@ def window_rows(
         mean_xy += weighted_a * b
     plane = height.to(tl.int64) * length
     at = sums + y * length + i
-    here = (y < height) & (i < length)
     tl.store(at, mean_x, mask=here)
     tl.store(at + plane, mean_y, mask=here)
     tl.store(at + 2 * plane, mean_xx, mask=here)
@@ -78,38 +84,14 @@ def window_rows(
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def measure(
-    image,
-    target,
-    mask,
-    sums,
-    maps,
-    partials,
-    height,
-    length,
-    HAS_MASK: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
+def measure(image, target, mask, sums, maps, partials, height, length, HAS_MASK: tl.constexpr):
     """Store the derivatives of SSIM by the window means, ``maps`` [3, H, length], and sums [programs, 4]."""
-    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
-    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
-    here = (y < height) & (i < length)
+    y, i, here = places(height, length)
     plane = height.to(tl.int64) * length
-    m = tl.zeros([ROWS, COLUMNS], tl.float32)
-    n = tl.zeros([ROWS, COLUMNS], tl.float32)
-    p = tl.zeros([ROWS, COLUMNS], tl.float32)
-    q = tl.zeros([ROWS, COLUMNS], tl.float32)
-    r = tl.zeros([ROWS, COLUMNS], tl.float32)
-    for tap in tl.static_range(11):
-        row = y + (tap - 5)
-        inside = (row >= 0) & (row < height) & (i < length)
-        at = sums + row * length + i
-        m += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        n += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        p += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        q += tl.load(at + 3 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        r += tl.load(at + 4 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+    m, n = sum_of_rows(sums, y, i, height, length), sum_of_rows(sums + plane, y, i, height, length)
+    p = sum_of_rows(sums + 2 * plane, y, i, height, length)
+    q = sum_of_rows(sums + 3 * plane, y, i, height, length)
+    r = sum_of_rows(sums + 4 * plane, y, i, height, length)
     a = kept(image, mask, y, i, here, length, HAS_MASK)
     b = kept(target, mask, y, i, here, length, HAS_MASK)
     counts = here.to(tl.float32)
@@ -138,26 +120,17 @@ def measure(
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def window_maps(maps, sums, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """Store the window sums of the three maps along the rows: ``sums`` [3, H, length]."""
-    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
-    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
-    plane = height.to(tl.int64) * length
-    by_mean = tl.zeros([ROWS, COLUMNS], tl.float32)
-    by_square = tl.zeros([ROWS, COLUMNS], tl.float32)
-    by_product = tl.zeros([ROWS, COLUMNS], tl.float32)
+def window_maps(maps, sums, height, length):
+    """Store the window sums of one of the three maps along the rows: ``sums`` [3, H, length]."""
+    y, i, here = places(height, length)
+    plane = tl.program_id(2) * height.to(tl.int64) * length
+    total = zeros()
     for tap in tl.static_range(11):
         j = i + 3 * (tap - 5)
         inside = (y < height) & (j >= 0) & (j < length)
-        at = maps + y * length + j
-        by_mean += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        by_square += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-    at = sums + y * length + i
-    here = (y < height) & (i < length)
-    tl.store(at, by_mean, mask=here)
-    tl.store(at + plane, by_square, mask=here)
-    tl.store(at + 2 * plane, by_product, mask=here)
+        value = tl.load(maps + plane + y * length + j, mask=inside, other=0.0)
+        total += value * device_layout.SSIM_WINDOW[tap]
+    tl.store(sums + plane + y * length + i, total, mask=here)
 
 
 @triton.jit(do_not_specialize=["height", "length"])
@@ -173,24 +146,13 @@ def differentiate(
     height,
     length,
     HAS_MASK: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
 ):
     """Store (l1_weight sign(x - y) + ssim_weight d(sum of SSIM)/dx) / count, and 0 where masked."""
-    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
-    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
-    here = (y < height) & (i < length)
+    y, i, here = places(height, length)
     plane = height.to(tl.int64) * length
-    by_mean = tl.zeros([ROWS, COLUMNS], tl.float32)
-    by_square = tl.zeros([ROWS, COLUMNS], tl.float32)
-    by_product = tl.zeros([ROWS, COLUMNS], tl.float32)
-    for tap in tl.static_range(11):
-        row = y + (tap - 5)
-        inside = (row >= 0) & (row < height) & (i < length)
-        at = sums + row * length + i
-        by_mean += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        by_square += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
-        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+    by_mean = sum_of_rows(sums, y, i, height, length)
+    by_square = sum_of_rows(sums + plane, y, i, height, length)
+    by_product = sum_of_rows(sums + 2 * plane, y, i, height, length)
     a = kept(image, mask, y, i, here, length, HAS_MASK)
     b = kept(target, mask, y, i, here, length, HAS_MASK)
     share = (1.0 / tl.maximum(tl.load(totals + 3), 1.0)).to(tl.float32)
@@ -214,30 +176,16 @@ def loss_sums(
     gradient: Tensor,
 ) -> Tensor:
     """See ``cleargs.splat.backend.Backend``. The sums stay on the device."""
-    height, length = image.shape[0], 3 * image.shape[1]
+    size = height, length = image.shape[0], 3 * image.shape[1]
     sums, maps = (torch.empty(planes * height * length, device=image.device) for planes in (5, 3))
-    grid = (-(-length // COLUMNS), -(-height // ROWS))
+    grid = (-(-length // LOSS_COLUMNS), -(-height // LOSS_ROWS))
     partials = torch.empty(grid[0] * grid[1], 4, dtype=torch.float64, device=image.device)
-    image, target = image.detach().contiguous(), target.contiguous()
     bits = image if mask is None else mask.contiguous().view(torch.uint8)
-    block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "num_warps": 4}
-    has_mask = mask is not None
-    window_rows[grid](image, target, bits, sums, height, length, HAS_MASK=has_mask, **block)
-    measure[grid](image, target, bits, sums, maps, partials, height, length, HAS_MASK=has_mask, **block)
+    images = image.detach().contiguous(), target.contiguous(), bits
+    options = {"HAS_MASK": mask is not None, "num_warps": 4}
+    window_rows[grid](*images, sums, *size, **options)
+    measure[grid](*images, sums, maps, partials, *size, **options)
     totals = partials.sum(0)
-    window_maps[grid](maps, sums, height, length, **block)
-    differentiate[grid](
-        image,
-        target,
-        bits,
-        sums,
-        totals,
-        gradient,
-        l1_weight,
-        ssim_weight,
-        height,
-        length,
-        HAS_MASK=has_mask,
-        **block,
-    )
+    window_maps[(*grid, 3)](maps, sums, *size, num_warps=4)
+    differentiate[grid](*images, sums, totals, gradient, l1_weight, ssim_weight, *size, **options)
     return totals

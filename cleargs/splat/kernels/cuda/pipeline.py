@@ -16,6 +16,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import rasteriser
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cuda import binning, device_layout, gradients, projection, rasterise
+from cleargs.splat.kernels.cuda.device_layout import LIST_BLOCK, PROJECT_BLOCK, TOTAL_ROWS
 from cleargs.splat.kernels.cuda.support import memory_errors
 from cleargs.splat.kernels.rasteriser import tiles_of
 from cleargs.splat.types import Render
@@ -24,11 +25,6 @@ FORWARD_WARPS = 2
 """Warps per tile, forward: four pixels per lane."""
 BACKWARD_WARPS = 1
 """Warps per chunk, backward: with one, sums over pixels need shuffles and no barrier."""
-PROJECT_BLOCK = 128
-LIST_BLOCK = 32
-ORDER_BLOCK = 1024
-TOTAL_ROWS = 16
-TOTAL_BLOCK = 16
 
 PAIR_BYTES = 4 * (
     4 + layout.PAIR_COLUMNS + layout.TILE_PIXELS * (device_layout.CHUNK_PLANES + 1) // device_layout.CHUNK
@@ -153,15 +149,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
         if n:
             totals = take("totals", layout.PAIR_COLUMNS, n, dtype=torch.float64)
             gradients.total[(-(-n // TOTAL_ROWS),)](
-                state.tile_counts,
-                state.pair_starts,
-                pair_sums,
-                totals,
-                n,
-                COLUMNS=columns,
-                ROWS=TOTAL_ROWS,
-                BLOCK=TOTAL_BLOCK,
-                num_warps=4,
+                state.tile_counts, state.pair_starts, pair_sums, totals, n, COLUMNS=columns, num_warps=4
             )
             gradients.backpropagate[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in parameters.values()),
@@ -175,7 +163,6 @@ class CudaRasteriser(rasteriser.Rasteriser):
                 SH_COUNT=state.sh_count,
                 ANTIALIAS=state.antialias,
                 HAS_DEPTH=grad_depth is not None,
-                BLOCK=PROJECT_BLOCK,
                 num_warps=4,
             )
         return Gaussians(**outputs)
@@ -206,7 +193,6 @@ class CudaRasteriser(rasteriser.Rasteriser):
                 SH_STORED=gaussians.sh.shape[1],
                 SH_COUNT=inputs.sh_count,
                 ANTIALIAS=inputs.antialias,
-                BLOCK=PROJECT_BLOCK,
                 num_warps=4,
                 enable_fp_fusion=False,
             )
@@ -230,15 +216,12 @@ class CudaRasteriser(rasteriser.Rasteriser):
                 n,
                 width,
                 height,
-                BLOCK=LIST_BLOCK,
                 num_warps=1,
                 enable_fp_fusion=False,
             )
         sorted_tiles, sorted_slots = torch.sort(pair_tiles, stable=True)
-        if pairs:
-            binning.order_pairs[(-(-pairs // ORDER_BLOCK),)](
-                sorted_slots, pair_owners, pair_ids, pair_slots, pairs, BLOCK=ORDER_BLOCK, num_warps=4
-            )
+        torch.index_select(pair_owners, 0, sorted_slots, out=pair_ids)
+        pair_slots.copy_(sorted_slots)
         tile_starts = binning.tile_starts(sorted_tiles, tiles)
         planes = device_layout.CHUNK_PLANES + depth
         # Only the device knows the number of chunks. This is an upper bound.

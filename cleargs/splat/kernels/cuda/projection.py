@@ -131,7 +131,6 @@ def project(
     SH_STORED: tl.constexpr,
     SH_COUNT: tl.constexpr,
     ANTIALIAS: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """Store packed splats [N, 16], depth keys [N], numbers of touched tiles [N] int32 and radii [N] in px.
 
@@ -139,7 +138,7 @@ def project(
     then infinity, its count and its radius are 0. Launch it without fused multiply and add, as
     ``binning.list_pairs``, which must find the same tiles.
     """
-    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
     mask = g < n
     mean = load_triple(means + g * 3, mask)
     position = camera_position(mean, view)
@@ -178,9 +177,8 @@ def project(
         (towards[1] / distance).to(tl.float32),
         (towards[2] / distance).to(tl.float32),
     )
-    red = tl.zeros([BLOCK], tl.float32)
-    green = tl.zeros([BLOCK], tl.float32)
-    blue = tl.zeros([BLOCK], tl.float32)
+    zero = tl.zeros_like(g).to(tl.float32)
+    red, green, blue = zero, zero, zero
     for k in tl.static_range(SH_COUNT):
         coefficient = sh + (g * SH_STORED + k) * 3
         red += basis[k] * tl.load(coefficient, mask=mask, other=0.0)

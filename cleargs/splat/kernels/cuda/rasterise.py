@@ -22,6 +22,19 @@ from cleargs.splat.kernels.cuda import device_layout
 
 
 @triton.jit
+def pixels_of(tile, width, height):
+    """Return the numbers of a tile's pixels in the tile and in the image, which are inside, and x and y."""
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    pixel = tl.arange(0, layout.TILE_PIXELS)
+    column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
+    line = (tile // tiles_x) * layout.TILE + pixel // layout.TILE
+    inside = (column < width) & (line < height)
+    x = column.to(tl.float32) + constants.PIXEL_CENTRE
+    y = line.to(tl.float32) + constants.PIXEL_CENTRE
+    return pixel, line * width + column, inside, x, y
+
+
+@triton.jit
 def splat_alpha(x, y, row):
     """Return u, dy, alpha before clamp and cut, and blended alpha of a packed splat, at pixel centres.
 
@@ -61,13 +74,7 @@ def forward(
     the number of the tile's last contributor.
     """
     tile = tl.program_id(0)
-    tiles_x = (width + layout.TILE - 1) // layout.TILE
-    pixel = tl.arange(0, layout.TILE_PIXELS)
-    column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
-    line = (tile // tiles_x) * layout.TILE + pixel // layout.TILE
-    inside = (column < width) & (line < height)
-    x = column.to(tl.float32) + constants.PIXEL_CENTRE
-    y = line.to(tl.float32) + constants.PIXEL_CENTRE
+    pixel, at, inside, x, y = pixels_of(tile, width, height)
     begin, end = tl.load(tile_starts + tile), tl.load(tile_starts + tile + 1)
     chunk = tl.load(chunk_starts + tile)
     chunks = tl.load(chunk_starts + tile + 1) - chunk
@@ -126,7 +133,6 @@ def forward(
         goes_on = (start < end) & (tl.max(live, axis=0) > 0.0)
 
     tl.store(deepest + tile, tl.max(deep, axis=0))
-    at = line * width + column
     tl.store(image + at * 3, red + rest * tl.load(background), mask=inside)
     tl.store(image + at * 3 + 1, green + rest * tl.load(background + 1), mask=inside)
     tl.store(image + at * 3 + 2, blue + rest * tl.load(background + 2), mask=inside)
@@ -156,12 +162,7 @@ def behind(
 ):
     """Store S, g · all that is behind, for every chunk of a tile that contributes: [C, 256]."""
     tile = tl.program_id(0)
-    tiles_x = (width + layout.TILE - 1) // layout.TILE
-    pixel = tl.arange(0, layout.TILE_PIXELS)
-    column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
-    line = (tile // tiles_x) * layout.TILE + pixel // layout.TILE
-    inside = (column < width) & (line < height)
-    at = line * width + column
+    pixel, at, inside, _, _ = pixels_of(tile, width, height)
     red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
     green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
     blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
@@ -207,7 +208,8 @@ def backward(
 ):
     """Store the sums of every pair of one chunk, in the rows of ``pair_sums`` [P, 10] at the pairs' slots.
 
-    Programs after the last chunk do nothing: the launch knows only an upper bound of the number of chunks.
+    Pairs are visited from far to near. Programs after the last chunk do nothing: the launch knows only an
+    upper bound of the number of chunks.
     """
     chunk = tl.program_id(0)
     if chunk < tl.load(chunk_starts + tiles):
@@ -217,105 +219,53 @@ def backward(
         end = tl.minimum(start + device_layout.CHUNK, tl.load(tile_starts + tile + 1))
         contributing = tl.minimum(end, begin + tl.load(deepest + tile))
 
-        place = start + tl.arange(0, device_layout.CHUNK)
-        unseen = (place >= contributing) & (place < end)
-        slots = tl.load(pair_slots + place, mask=unseen, other=0).to(tl.int64)
+        places = start + tl.arange(0, device_layout.CHUNK)
+        unseen = (places >= contributing) & (places < end)
+        slots = tl.load(pair_slots + places, mask=unseen, other=0).to(tl.int64)
         for k in tl.static_range(COLUMNS):
             tl.store(pair_sums + slots * layout.PAIR_COLUMNS + k, 0.0, mask=unseen)
         if start < contributing:
-            backward_chunk(
-                chunk,
-                tile,
-                begin,
-                start,
-                contributing,
-                chunk_planes,
-                chunk_behind,
-                pair_ids,
-                pair_slots,
-                splats,
-                last,
-                grad_image,
-                grad_depth,
-                pair_sums,
-                width,
-                height,
-                HAS_DEPTH,
-                PLANES,
-            )
-
-
-@triton.jit
-def backward_chunk(
-    chunk,
-    tile,
-    begin,
-    start,
-    end,
-    chunk_planes,
-    chunk_behind,
-    pair_ids,
-    pair_slots,
-    splats,
-    last,
-    grad_image,
-    grad_depth,
-    pair_sums,
-    width,
-    height,
-    HAS_DEPTH: tl.constexpr,
-    PLANES: tl.constexpr,
-):
-    """Visit the places ``end`` - 1 down to ``start`` and store each pair's sums."""
-    tiles_x = (width + layout.TILE - 1) // layout.TILE
-    pixel = tl.arange(0, layout.TILE_PIXELS)
-    column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
-    line = (tile // tiles_x) * layout.TILE + pixel // layout.TILE
-    inside = (column < width) & (line < height)
-    x = column.to(tl.float32) + constants.PIXEL_CENTRE
-    y = line.to(tl.float32) + constants.PIXEL_CENTRE
-    at = line * width + column
-    deep = tl.load(last + at, mask=inside, other=0)
-    grad_red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
-    grad_green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
-    grad_blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
-    number = chunk.to(tl.int64) * layout.TILE_PIXELS
-    t = tl.load(
-        chunk_planes + number * PLANES + device_layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS + pixel
-    )
-    far = tl.load(chunk_behind + number + pixel)
-    if HAS_DEPTH:
-        grad_z = tl.load(grad_depth + at, mask=inside, other=0.0)
-    following = tl.load(pair_ids + end - 1)
-    for step in range(0, end - start):
-        place = end - 1 - step
-        g = following
-        following = tl.load(pair_ids + tl.maximum(place - 1, start))
-        row = splats + g.to(tl.int64) * layout.SPLAT_COLUMNS
-        u, dy, raw, blended = splat_alpha(x, y, row)
-        blended = tl.where(deep > place - begin, blended, 0.0)
-        inverse = 1.0 / (1.0 - blended)
-        t = t * inverse
-        weight = blended * t
-        gain = grad_red * tl.load(row + layout.RED)
-        gain += grad_green * tl.load(row + layout.GREEN)
-        gain += grad_blue * tl.load(row + layout.BLUE)
-        if HAS_DEPTH:
-            gain += grad_z * tl.load(row + layout.DEPTH)
-        own = weight * gain
-        v = tl.where(raw < constants.ALPHA_MAX, own - blended * (far * inverse), 0.0)
-        far += own
-        vu = v * u
-        vy = v * dy
-        sums = pair_sums + tl.load(pair_slots + place).to(tl.int64) * layout.PAIR_COLUMNS
-        tl.store(sums + layout.SUM_V, tl.sum(v, axis=0))
-        tl.store(sums + layout.SUM_VU, tl.sum(vu, axis=0))
-        tl.store(sums + layout.SUM_VY, tl.sum(vy, axis=0))
-        tl.store(sums + layout.SUM_VUU, tl.sum(vu * u, axis=0))
-        tl.store(sums + layout.SUM_VUY, tl.sum(vu * dy, axis=0))
-        tl.store(sums + layout.SUM_VYY, tl.sum(vy * dy, axis=0))
-        tl.store(sums + layout.SUM_RED, tl.sum(weight * grad_red, axis=0))
-        tl.store(sums + layout.SUM_GREEN, tl.sum(weight * grad_green, axis=0))
-        tl.store(sums + layout.SUM_BLUE, tl.sum(weight * grad_blue, axis=0))
-        if HAS_DEPTH:
-            tl.store(sums + layout.SUM_DEPTH, tl.sum(weight * grad_z, axis=0))
+            pixel, at, inside, x, y = pixels_of(tile, width, height)
+            deep = tl.load(last + at, mask=inside, other=0)
+            grad_red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
+            grad_green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
+            grad_blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
+            number = chunk.to(tl.int64) * layout.TILE_PIXELS
+            planes = chunk_planes + number * PLANES + pixel
+            t = tl.load(planes + device_layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS)
+            far = tl.load(chunk_behind + number + pixel)
+            if HAS_DEPTH:
+                grad_z = tl.load(grad_depth + at, mask=inside, other=0.0)
+            following = tl.load(pair_ids + contributing - 1)
+            for step in range(0, contributing - start):
+                place = contributing - 1 - step
+                g = following
+                following = tl.load(pair_ids + tl.maximum(place - 1, start))
+                row = splats + g.to(tl.int64) * layout.SPLAT_COLUMNS
+                u, dy, raw, blended = splat_alpha(x, y, row)
+                blended = tl.where(deep > place - begin, blended, 0.0)
+                inverse = 1.0 / (1.0 - blended)
+                t = t * inverse
+                weight = blended * t
+                gain = grad_red * tl.load(row + layout.RED)
+                gain += grad_green * tl.load(row + layout.GREEN)
+                gain += grad_blue * tl.load(row + layout.BLUE)
+                if HAS_DEPTH:
+                    gain += grad_z * tl.load(row + layout.DEPTH)
+                own = weight * gain
+                v = tl.where(raw < constants.ALPHA_MAX, own - blended * (far * inverse), 0.0)
+                far += own
+                vu = v * u
+                vy = v * dy
+                sums = pair_sums + tl.load(pair_slots + place).to(tl.int64) * layout.PAIR_COLUMNS
+                tl.store(sums + layout.SUM_V, tl.sum(v, axis=0))
+                tl.store(sums + layout.SUM_VU, tl.sum(vu, axis=0))
+                tl.store(sums + layout.SUM_VY, tl.sum(vy, axis=0))
+                tl.store(sums + layout.SUM_VUU, tl.sum(vu * u, axis=0))
+                tl.store(sums + layout.SUM_VUY, tl.sum(vu * dy, axis=0))
+                tl.store(sums + layout.SUM_VYY, tl.sum(vy * dy, axis=0))
+                tl.store(sums + layout.SUM_RED, tl.sum(weight * grad_red, axis=0))
+                tl.store(sums + layout.SUM_GREEN, tl.sum(weight * grad_green, axis=0))
+                tl.store(sums + layout.SUM_BLUE, tl.sum(weight * grad_blue, axis=0))
+                if HAS_DEPTH:
+                    tl.store(sums + layout.SUM_DEPTH, tl.sum(weight * grad_z, axis=0))

@@ -1,8 +1,7 @@
 """Compare the GPU's kernels with the CPU's on this machine.
 
 ``cleargs.gpu`` runs this module in a child process and reads its lines of JSON from stdout. Every check runs
-twice on the GPU and once on the CPU. The results of the GPU must agree with the CPU's within the tolerances
-of ``tests/gpu``, and must be the same bits in both runs.
+twice on the GPU, with the same bits, and once on the CPU, within the tolerances of ``tests/gpu``.
 """
 
 from __future__ import annotations
@@ -254,16 +253,8 @@ def faults(run: Run, gpu: Backend, cpu: Backend, device: torch.device) -> Iterat
 # -- pace and memory ---------------------------------------------------------------------------------------
 
 
-def allocated(device: torch.device) -> int:
-    """Return the bytes that tensors take on the GPU."""
-    return torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
-
-
 def iterate(view: View, repeats: int, backend: Backend, device: torch.device) -> tuple[float, int]:
-    """Return the milliseconds of the fastest training step, and the growth of the memory in bytes.
-
-    The first three steps compile kernels and fill buffers: they do not count.
-    """
+    """Return the milliseconds of the fastest training step after three, and the growth of memory in bytes."""
     gaussians, camera = view.scene(device)
     target = _random(view.height, view.width, 3, device=device)
     slope, moments, engine = torch.empty_like(target), Moments.zeros(gaussians), backend.rasteriser(device)
@@ -277,15 +268,12 @@ def iterate(view: View, repeats: int, backend: Backend, device: torch.device) ->
             backend.adam_step(getattr(gaussians, name), gradient, first, second, step, 0.0)
         float(gaussians.means[0, 0])  # waits for the device
         times.append(1e3 * (time.perf_counter() - start))
-        held = allocated(device) if step <= 3 else held
-    return min(times[3:]), allocated(device) - held
+        held = torch.cuda.memory_allocated() if step <= 3 else held
+    return min(times[3:]), torch.cuda.memory_allocated() - held
 
 
 def main(device: str = "cuda", sizes: Sizes = FULL) -> None:
-    """Run all checks; print a line before and after each.
-
-    An exception ends the test: a GPU may answer nothing after it.
-    """
+    """Run all checks; print a line before and after each. An exception ends the test: the GPU may be dead."""
 
     def say(**facts: Any) -> None:
         print(json.dumps(facts), flush=True)

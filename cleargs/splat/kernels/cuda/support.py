@@ -55,10 +55,7 @@ def memory_errors() -> Iterator[None]:
 
 
 def gpu_fault(error: BaseException | None) -> str | None:
-    """Return in one line what the GPU, its driver or a library on it reported; None for any other error.
-
-    The causes of ``error`` are searched too.
-    """
+    """Return in one line what the GPU, its driver or a library on it reported; None for any other error."""
     while error is not None:
         line = (str(error).strip().splitlines() or [""])[0]
         if isinstance(error, torch.cuda.OutOfMemoryError):
