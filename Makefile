@@ -14,10 +14,11 @@
 # make browser           install what the browser tests of the report need in addition to Debian's chromium
 # make oracles           install .oracles, npm packages that read exported scenes in the tests
 # make cluster           install .venv-cluster, the Snakemake that runs a sheet on a cluster
-# TORCH_INDEX=URL gives pip another index for torch, for example one with CPU-only builds.
+# PyTorch comes as its CPU build, which is much smaller. GPU=1 takes the build for NVIDIA GPUs, TORCH_INDEX=URL another index.
 
 PYTHON ?= python3
 BIN := .venv/bin
+TORCH_INDEX ?= $(if $(GPU),,https://download.pytorch.org/whl/cpu)
 
 # $(call install,ENVIRONMENT,SECTIONS OF requirements.lock,OUR PACKAGE,PACKAGES OF PYTORCH): pip checks the digest of every
 # file, except those of torch, whose builds differ by machine.
@@ -34,8 +35,8 @@ PINS := pyproject.toml requirements.lock constraints.txt
 
 env: .venv/demo.stamp
 
-demo: env demo/capture/transforms.json
-	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
+demo: env
+	$(BIN)/cleargs demo
 
 # The tests of a file run in one process, so that they make shared fixtures once.
 test: .venv/test.stamp
@@ -53,7 +54,7 @@ test-package: dist
 	mkdir dist/try
 	cd dist/try && ../env/bin/python -P ../../tests/installed.py
 	cd dist/try && ../env/bin/cleargs synth capture --protocol mixed --frames 8 --size 240x136
-	cd dist/try && ../env/bin/cleargs run capture -o run --workflow smoke
+	cd dist/try && ../env/bin/cleargs run capture -o run --recipe smoke
 	cd dist/try && ../env/bin/cleargs verify run
 
 dist: .venv/dev.stamp
@@ -101,10 +102,6 @@ cluster: .venv-cluster/stamp
 	$(PYTHON) -m venv .venv-cluster
 	$(call install,.venv-cluster,cluster)
 	touch $@
-
-demo/capture/transforms.json: | .venv/demo.stamp
-	rm -rf demo/capture
-	$(BIN)/cleargs synth demo/capture --protocol mixed --frames 16 --size 480x270
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -6,7 +6,9 @@ import click
 
 from benchmarks.comparison.compare_command import compare
 from benchmarks.comparison.evidence_command import evidence
+from benchmarks.comparison.real_command import real
 from benchmarks.comparison.world_command import world
+from benchmarks.poses import poses
 from benchmarks.rva.agree_command import agree
 from benchmarks.rva.check_command import check
 from benchmarks.speed.commands import formation, quality, splat, train
@@ -25,7 +27,7 @@ def rva() -> None:
     """Compare evaluators of frames and check them against ground truth."""
 
 
-for command in (splat, train, formation, quality, compare, evidence, world):
+for command in (splat, train, formation, quality, compare, evidence, real, world, poses):
     benchmarks.add_command(command)
 for command in (agree, check):
     rva.add_command(command)

@@ -9,8 +9,13 @@ __version__ = "0.2.0"
 _HOMES = {
     "run": "api",
     **dict.fromkeys(("open_run", "Run", "StageResults", "open_prepared", "Prepared"), "run_results"),
-    **dict.fromkeys(("initialise", "train", "render_view", "save", "load"), "api"),
-    **dict.fromkeys(("score_frames", "score", "restore", "deblur", "evaluate_scene"), "api"),
+    **dict.fromkeys(("initialise", "train", "render_view", "save", "load", "export", "film"), "api"),
+    **dict.fromkeys(
+        ("score_frames", "score", "restore", "deblur", "evaluate_scene"),
+        "api",
+    ),
+    "write_report": "api",
+    "make_capture": "synth.synthetic_capture",
     "Camera": "splat.camera",
     "CleargsError": "errors",
     "G0Config": "stages.g0",

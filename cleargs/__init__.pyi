@@ -1,5 +1,7 @@
 from cleargs.api import deblur as deblur
 from cleargs.api import evaluate_scene as evaluate_scene
+from cleargs.api import export as export
+from cleargs.api import film as film
 from cleargs.api import initialise as initialise
 from cleargs.api import load as load
 from cleargs.api import render_view as render_view
@@ -9,6 +11,7 @@ from cleargs.api import save as save
 from cleargs.api import score as score
 from cleargs.api import score_frames as score_frames
 from cleargs.api import train as train
+from cleargs.api import write_report as write_report
 from cleargs.errors import CleargsError as CleargsError
 from cleargs.run_results import Prepared as Prepared
 from cleargs.run_results import Run as Run
@@ -23,6 +26,7 @@ from cleargs.splat.views import TrainingView as TrainingView
 
 # An installed package has cleargs.stages. In a checkout it is the folder stages/, which mypy does not search.
 from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]
+from cleargs.synth.synthetic_capture import make_capture as make_capture
 
 View = TrainingView  # former name
 

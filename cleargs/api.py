@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_run, usable_cores
+from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.progress import LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import SCENE, Prepared, Run, open_prepared
 from cleargs.splat.budget import resolve_config
@@ -44,9 +44,9 @@ Progress = Reporter | Say | None
 
 def run(
     source: str | Path,
-    folder: str | Path,
+    folder: str | Path | None = None,
     *,
-    workflow: str | None = None,
+    recipe: str | None = None,
     quality: Quality | None = None,
     set: Mapping[str, Any] | None = None,
     until: str | None = None,
@@ -57,6 +57,7 @@ def run(
     threads: int | None = None,
     store: str | Path | None = None,
     progress: Progress = None,
+    workflow: str | None = None,
 ) -> Run:
     """Turn a capture into a clean scene in the run folder ``folder``, as ``cleargs run`` does.
 
@@ -64,8 +65,9 @@ def run(
 
     Args:
         source: A video, an image folder, a COLMAP project, or a folder with ``transforms.json``.
-        folder: The run folder, which is created if necessary.
-        workflow: Name or path of a recipe. Without one, an existing run keeps its settings.
+        folder: The run folder, which is created if necessary (default: next to the capture, as
+            ``cleargs run`` chooses it).
+        recipe: Name or path of a recipe. Without one, an existing run keeps its settings.
         quality: Cost of the trainings: draft, standard or high (setting ``g0.quality``).
         set: Settings by name, for example ``{"rva.tau_R": 0.6}``.
         until: The last stage to run (default: all stages).
@@ -76,6 +78,7 @@ def run(
         threads: Number of threads (default: all usable cores).
         store: Folder for results (default: that of the run, or ``.store`` in ``folder``).
         progress: Receiver of progress and remarks.
+        workflow: Former name of ``recipe``.
 
     Raises:
         InputError: if the capture or a setting cannot be used.
@@ -92,8 +95,8 @@ def run(
     spec = resolve_run(
         dag,
         Path(source),
-        Path(folder),
-        workflow=workflow,
+        default_folder(Path(source)) if folder is None else Path(folder),
+        recipe=recipe or workflow,
         overrides=[
             *([f"g0.quality={quality}"] if quality else []),
             # Settings are parsed as TOML, which reads these JSON values too.
@@ -133,7 +136,7 @@ def initialise(
     from cleargs import G0Config
     from cleargs.capture.tables import load_observations
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
-    from cleargs.splat.scene import Scene
+    from cleargs.splat.scene import BLACK, Scene
 
     views = capture.views() if views is None else views
     config = resolve_config(config or G0Config(), views)
@@ -148,7 +151,7 @@ def initialise(
         sh_degree=config.sh_degree,
         seed=seed,
     )
-    return Scene(gaussians, config.antialias, config.background)
+    return Scene(gaussians, config.antialias, config.background or BLACK)
 
 
 def train(
@@ -248,6 +251,72 @@ def load(path: str | Path) -> Scene:
     from cleargs.splat.ply import read_ply
 
     return read_ply(Path(path))
+
+
+def export(run: Run, *files: str | Path, stage: str | None = None, **options: Any) -> list[str]:
+    """Write the scene of a run to files for other programs, as ``cleargs export`` does.
+
+    Args:
+        run: A run with a trained scene.
+        files: The new files. Their endings choose the formats (see `save`).
+        stage: The stage whose scene is written (default: the last one that has a scene).
+        options: Fields of `cleargs.render.export.ExportOptions`: ``up``, ``world``, ``metres``,
+            ``sh_degree``, ``prune``, ``crop``, ``cameras``, ``force``.
+
+    Returns:
+        Messages about the result.
+
+    Raises:
+        InputError: if an option cannot be used, or if a file exists.
+
+    Example:
+        cg.export(cg.open_run("run"), "blender.ply", up="z", sh_degree=3)
+    """
+    from cleargs.render.export import ExportOptions, export_scene
+
+    paths = [Path(file) for file in files]
+    return export_scene(
+        run.folder, run.scene_file(stage).parent.name, paths, ExportOptions(**options), log_reporter()
+    )
+
+
+def film(run: Run, file: str | Path, *, stage: str | None = None, **options: Any) -> Path:
+    """Render a film (.mp4) along the path of the capture, or stills (.png, .exr), as ``cleargs render`` does.
+
+    Args:
+        run: A run with a trained scene.
+        file: The new file.
+        stage: The stage whose scene is rendered (default: the last one that has a scene).
+        options: Fields of `cleargs.render.shots.ShotOptions`: ``frame``, ``turntable``, ``poses``, ``world``,
+            ``size``, ``fps``, ``seconds``, ``side_by_side``, ``codec``.
+
+    Raises:
+        InputError: if an option cannot be used, or if the file exists.
+
+    Example:
+        cg.film(cg.open_run("run"), "still.png", frame=3)
+    """
+    from cleargs.render.shots import ShotOptions, render_run
+
+    path = Path(file)
+    render_run(run.scene_file(stage), path, ShotOptions(**options), log_reporter())
+    return path
+
+
+def write_report(run: Run, *, threads: int | None = None) -> Path:
+    """Write the report of a run. Return the path of its page.
+
+    Example:
+        page = cg.write_report(cg.open_run("run"))
+    """
+    from cleargs.pipeline.plan import Planner
+    from cleargs.pipeline.run_file import read_run_file
+    from cleargs.report.page import write_report
+
+    dag = installed()
+    spec = read_run_file(run.folder, dag)
+    with opened_store(spec.store) as opened:
+        return write_report(Planner(dag, spec, opened, threads or usable_cores(), log_reporter()))
 
 
 def score_frames(

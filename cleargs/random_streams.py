@@ -12,6 +12,7 @@ class Stream(IntEnum):
     PSEUDO_VIEWS = 1
     REFINEMENT = 2
     POSITION_NOISE = 3
+    BACKGROUND = 4
     RIVR = 5
     CONSOLIDATION = 6
     ADDED_POINTS = 100
@@ -30,3 +31,4 @@ class Stream(IntEnum):
     SHAKY_STRETCHES = 19
     BALLOON = 20
     PHONE_LOOK = 21
+    HOUSEHOLD = 30

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest, read_manifest
 from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_run_file
 
 if TYPE_CHECKING:
@@ -18,11 +21,7 @@ if TYPE_CHECKING:
     from cleargs.capture.tables import Frame, Points
     from cleargs.splat.camera import Camera
     from cleargs.splat.scene import Scene
-    from cleargs.splat.views import TrainingView
-
-
-SCENE = "scene.ply"
-"""File name of the scene in the results of a stage that trains."""
+    from cleargs.splat.views import TrainingView, ViewDataset
 
 
 def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
@@ -60,6 +59,14 @@ class Run:
         """Names of the finished stages, in order."""
         return tuple(name for name in installed().names if (self.folder / name).is_dir())
 
+    def _repr_html_(self) -> str:
+        """Return a table of the stages, for notebooks."""
+        rows = [("stage", "state", "seconds", "MB")]
+        for name, made in ((name, self[name].manifest) for name in self.stages):
+            rows.append((name, made.status, f"{made.seconds:.1f}", f"{made.bytes / 1e6:.1f}"))
+        body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+        return f"<p>{escape(str(self.folder))}</p><table>{body}</table>"
+
     def __getitem__(self, stage: str) -> StageResults:
         """Return the results of a stage. Raises InputError if it is not finished."""
         installed().check(stage)
@@ -87,6 +94,9 @@ class StageResults:
 
     folder: Path
     manifest: Manifest
+
+    def __repr__(self) -> str:
+        return f"<results of {self.manifest.stage} in {self.folder}: {', '.join(self.manifest.summary)}>"
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -145,6 +155,54 @@ class Prepared:
     frames: list[Frame]
     """All frames by frame_id, including those without a pose."""
     points: Points
+
+    def __repr__(self) -> str:
+        posed = sum(frame.registered for frame in self.frames)
+        return f"<capture in {self.folder}: {len(self.frames)} frames, {posed} with a pose>"
+
+    def dataset(self, weights: Mapping[int, float] | None = None) -> ViewDataset:
+        """Return `views` as a dataset of torch.
+
+        Example:
+            capture = cg.open_prepared(cg.open_run("run")["ingest"])
+            item = capture.dataset()[0]
+            print(item["image"].shape, item["K"])
+        """
+        from cleargs.splat.views import ViewDataset
+
+        return ViewDataset(self.views(weights))
+
+    def to_nerfstudio(self, folder: str | Path) -> Path:
+        """Write images, COLMAP model and ``transforms.json`` into a new folder, for other trainers.
+
+        ``images`` and ``sparse/0`` are next to each other, as gsplat and the Inria code read them. nerfstudio
+        reads ``transforms.json``. All poses are in normalised coordinates. Held-out frames are included.
+
+        Raises:
+            StoreError: if the folder exists or cannot be written.
+
+        Example:
+            cg.open_prepared(cg.open_run("run")["ingest"]).to_nerfstudio("for-gsplat")
+        """
+        import numpy as np
+
+        from cleargs.files import whole_folder, write_json
+
+        target, frames = Path(folder), []
+        by_id = {frame.frame_id: frame for frame in self.frames}
+        with whole_folder(target) as made:
+            shutil.copytree(self.folder / "colmap/sparse/0", made / "sparse/0")
+            (made / "images").mkdir()
+            for number, camera in self.cameras().items():
+                image = Path(by_id[number].image)
+                shutil.copyfile(self.folder / image, made / "images" / image.name)
+                pose = np.linalg.inv(camera.world_to_camera) * [1.0, -1.0, -1.0, 1.0]  # OpenGL axes
+                lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+                size = {"w": camera.width, "h": camera.height}
+                entry = {"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()}
+                frames.append({**entry, **lens, **size})
+            write_json(made / "transforms.json", {"camera_model": "PINHOLE", "frames": frames})
+        return target
 
     def views(self, weights: Mapping[int, float] | None = None) -> list[TrainingView]:
         """Return the views of a training: the frames with a pose that are not held out.

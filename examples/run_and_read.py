@@ -1,14 +1,14 @@
 """Run all stages on a capture and print the results.
 
-python run_and_read.py CAPTURE RUN [WORKFLOW]
+python run_and_read.py CAPTURE RUN [RECIPE]
 """
 
 import sys
 
 import cleargs as cg
 
-capture, folder, *workflow = sys.argv[1:]
-run = cg.run(capture, folder, workflow=workflow[0] if workflow else None, progress=print)
+capture, folder, *recipe = sys.argv[1:]
+run = cg.run(capture, folder, recipe=recipe[0] if recipe else None, progress=print)
 for stage in run.stages:
     print(stage, run[stage].summary)
 

@@ -18,7 +18,7 @@ G0_END, ROUNDS_END = 16 / 19, 18 / 19
 MAX_ROUNDS = 16
 """Maximum number of RIVR's rounds."""
 
-TRAINED = ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors")
+TRAINED = ("scene.ply", "exposure.parquet", "formation.parquet", "movement.parquet", "state.safetensors")
 """Outputs of a training from which the next training continues."""
 
 REPAIR_LIBRARIES = (
@@ -38,7 +38,7 @@ _GROWTH = (
 """Settings of the earlier trainings that had no effect on the later ones."""
 
 
-def other_libraries(device: Device) -> Mapping[str, str]:
+def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     """Return the versions of the other libraries that compute on ``device`` in rivr and consolidate."""
     from cleargs.models.onnx import runtime_version
 

@@ -42,7 +42,7 @@ class ConsolidateConfig(Settings):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 25
+VERSION = 28
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -93,7 +93,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + memory + g0.cache_mb / 1024.0,
-        disk_gb=0.7 * memory,  # scene and state: 1 kB a Gaussian
+        disk_gb=0.5 * memory,  # scene and moments: 0.7 kB per Gaussian of SH degree 3
     )
 
 
@@ -154,7 +154,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     verdict = judge_harm(
         supervision.holdout_ids,
         g0.fidelity(supervision.holdout_views, scorer, threads),
-        consolidated.fidelity(supervision.holdout_views, scorer, threads),
+        consolidated.fidelity(supervision.holdout_views, scorer, threads, g0),
         harm,
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)

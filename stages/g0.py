@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from cleargs.base_model import Unit
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
 from cleargs.splat.config import INIT_OPACITY, INIT_SCALE, TrainConfig
@@ -47,7 +46,6 @@ class G0Config(TrainConfig):
         "more than 5 %",
     )
     antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
-    background: tuple[Unit, Unit, Unit] = Field((0.0, 0.0, 0.0), description="sRGB behind the scene")
     min_points: int = Field(
         10_000,
         ge=1,
@@ -64,7 +62,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 25
+VERSION = 28
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -76,7 +74,7 @@ LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
 
-def other_libraries(device: Device) -> Mapping[str, str]:
+def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     """Return further libraries that compute on ``device``."""
     return {"triton": installed_version("triton")} if device == "cuda" else {}
 
@@ -104,7 +102,7 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
     start = max(config.min_points, sparse_points(context))
     seconds, memory = training_cost(config, count, megapixels, start)
     seconds *= pace(context.threads)
-    disk = 0.7 * memory  # scene and state: 1 kB a Gaussian
+    disk = 0.5 * memory  # scene and moments: 0.7 kB per Gaussian of SH degree 3
     memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
     return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=disk)
 
@@ -114,8 +112,10 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
+    from cleargs.formation.floaters import without_floaters
     from cleargs.formation.frames import real_views
-    from cleargs.formation.observed import evaluate_views, pooled_unseen
+    from cleargs.formation.movement import write_movement
+    from cleargs.formation.observed import Fit, evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -123,7 +123,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.splat.budget import resolve_config
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.ply import write_ply
-    from cleargs.splat.scene import Scene
+    from cleargs.splat.scene import BLACK, Scene
     from cleargs.splat.state import save_state
     from cleargs.splat.tables import TRAIN
     from cleargs.splat.trainer import Trainer
@@ -149,9 +149,15 @@ def run(context: StageContext[G0Config]) -> StageResult:
         say=lambda remark: context.reporter.info(f"G0: {remark}"),
     )
     exposure, spread = _exposure(config, views, sparse)
-    formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
+    formation = CaptureFormation(
+        views,
+        config.formation,
+        exposure=exposure,
+        lr_exposure=config.lr_exposure,
+        draft=config.quality == "draft",
+    )
     trainer = Trainer(
-        Scene(gaussians, config.antialias, config.background),
+        Scene(gaussians, config.antialias, config.background or BLACK),
         views,
         config,
         seed=(context.seed,),
@@ -160,16 +166,23 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
     checkpoint = context.checkpoints / "g0.safetensors"
     trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
+    learned = formation.exposure or Exposure.identity([view.frame_id for view in views])
+    moving = formation.moving
+
+    def evaluate(scene: Scene) -> list[Fit]:
+        """Compare a scene with all views as they were filmed, except where something moves."""
+        return evaluate_views(scene, views, learned, formation.frames, moving=moving)
+
+    cameras, count = [view.camera for view in views], trained.scene.gaussians.num
+    trained, fits = without_floaters(trained, cameras, context.device, evaluate)
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
-    learned = formation.exposure or Exposure.identity([view.frame_id for view in views])
     write_exposure(context.out / "exposure.parquet", learned)
     weights = {view.frame_id: view.weight for view in views}
     write_formation(context.out / "formation.parquet", formation, weights)
+    write_movement(context.out / "movement.parquet", moving)
     save_state(context.out / "state.safetensors", trained.state)
 
-    on_device = trained.scene.to(context.device)
-    fits = evaluate_views(on_device, views, learned, formation.frames)
     psnr = {view.frame_id: fit.psnr for view, fit in zip(views, fits, strict=True)}
     strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
     return StageResult(
@@ -177,10 +190,12 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "views": len(views),
             "gaussians_start": gaussians.num,
             "gaussians": trained.scene.gaussians.num,
+            "floaters": count - trained.scene.gaussians.num,
             "steps": config.length,
             "sh_degree": gaussians.sh_degree,
             "exposure": exposure is not None,
             "exposure_spread": spread,
+            "moving_share": sum(float(cells.mean()) for cells in moving.values()) / len(views),
             "psnr_strong": _mean([psnr[frame_id] for frame_id in strong if frame_id in psnr]),
             "psnr_active": _mean(list(psnr.values())),
             "psnr_unseen": pooled_unseen(fits),

@@ -53,6 +53,9 @@ class IngestConfig(SfmConfig, CaptureConfig):
         return value
 
 
+FEW_FRAMES = 15
+"""Number of frames below which a warning is given."""
+
 DRAFT_FRAMES, DRAFT_SIZE = 60, 640
 """Most frames of a draft, and their longest side, px."""
 
@@ -68,7 +71,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update=limits)
 
 
-VERSION = 9
+VERSION = 11
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -156,6 +159,8 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
             "highlights compressed; record in SDR where colours must be exact"
         )
+    if len(capture.frames) < FEW_FRAMES:
+        reporter.warn(f"there are only {len(capture.frames)} frames; a good scene needs 30 or more")
     long_side = max(config.feature_size, config.max_size)
     capture = select_sharp_frames(capture, work, long_side, reporter)
     frames = prepare(capture, work, long_side, reporter)
@@ -178,7 +183,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
             "pose_convention": outcome.convention if capture.posed else None,
             "kept_out_matches_off_px": {name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
-            "lens": outcome.lens or None,
+            "cameras": scene.cameras(),
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),

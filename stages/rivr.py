@@ -121,7 +121,7 @@ class RivrConfig(Settings):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 27
+VERSION = 30
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -187,7 +187,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + memory + g0.cache_mb / 1024.0,
-        disk_gb=0.02 * megapixels * targets * (config.rounds + 1) + scenes,
+        disk_gb=0.02 * megapixels * targets * config.rounds + 0.5 * memory + scenes,
     )
 
 
@@ -255,7 +255,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         )
 
     before = g0.fidelity(supervision.holdout_views, rules.primary, threads)
-    after = current.fidelity(supervision.holdout_views, rules.primary, threads)
+    after = current.fidelity(supervision.holdout_views, rules.primary, threads, g0)
     verdict = judge_harm(supervision.holdout_ids, before, after, config.harm)
     if verdict.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")

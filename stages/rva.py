@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
+from cleargs.plugins import installed_version
 from cleargs.rva.config import AssessmentConfig, EvaluatorConfig
 
 
@@ -13,15 +14,15 @@ class RvaConfig(AssessmentConfig, EvaluatorConfig):
     """Reliability-aware View Allocation. The defaults are those of the paper, except `active_share`."""
 
 
-VERSION = 4
+VERSION = 5
 CONFIG = RvaConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
-    "ingest": ("frames.parquet", "observations.parquet", "images", "masks")
+    "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks")
 }
 OUTPUTS = ("frames.parquet", "bins.parquet")
 LEFTOVERS: tuple[str, ...] = ()
-LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "torch", "transformers")
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless")
 
 _SECONDS_PER_MEGAPIXEL = 0.1  # on one core, including decoding
 _REPLIES_PER_MINUTE = 20  # from a vision-language model, per connection: a guess, since the server is unknown
@@ -32,6 +33,12 @@ def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
     if config.evaluator == "qwen3-vl" and config.qwen.model_dir:
         return {"vlm": Path(config.qwen.model_dir).expanduser().absolute()}
     return {}
+
+
+def other_libraries(device: Device, config: RvaConfig) -> Mapping[str, str]:
+    """Return the libraries of a vision-language model, if it runs in this process."""
+    local = externals(config, Path())
+    return {name: installed_version(name) for name in ("torch", "transformers") if local}
 
 
 def preflight(config: RvaConfig) -> None:
@@ -70,11 +77,12 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     """
     import numpy as np
 
-    from cleargs.capture.tables import load_frames, load_observations
+    from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.parquet import write_table
     from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from, summary
     from cleargs.rva.evaluator import EvaluatedFrame, label
     from cleargs.rva.evaluators import make_evaluator
+    from cleargs.rva.hidden import with_hidden_parts
     from cleargs.rva.tables import BINS, FRAMES
 
     config, ingest = context.config, context.inputs["ingest"]
@@ -87,6 +95,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)
+    cues = with_hidden_parts(cues, frames, load_points(ingest), observations)
     frame_id = np.array([frame.frame_id for frame in frames], dtype=np.int32)
     result = assess(frame_id, cues, poses_from(frames), observations, config)
 

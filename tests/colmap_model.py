@@ -10,6 +10,7 @@ import pyarrow as pa
 from cleargs.capture.cameras import Pose, pinhole
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.tables import POINTS, load_frames
+from cleargs.formation.movement import write_movement
 from cleargs.formation.table import FORMATION
 from cleargs.parquet import write_table
 
@@ -45,5 +46,6 @@ def write_sparse(ingest: Path) -> None:
 
 
 def write_no_formation(stage: Path) -> None:
-    """Write the ``formation.parquet`` of a training that found no motion."""
+    """Write the tables of a training that found no motion and no movement."""
     write_table(stage / "formation.parquet", pa.Table.from_pylist([], FORMATION), FORMATION)
+    write_movement(stage / "movement.parquet", {})

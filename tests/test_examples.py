@@ -9,9 +9,13 @@ import sys
 from pathlib import Path
 from textwrap import dedent
 
+import numpy as np
+import pycolmap
 import pytest
+import torch
 
 import cleargs as cg
+from cleargs.errors import CleargsError
 from cleargs.progress import SilentReporter
 from cleargs.synth.synthetic_capture import make_capture
 
@@ -38,7 +42,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("examples")
     make_capture(folder / "room", "mixed", frames=8, width=96, height=54, seed=0, reporter=SilentReporter())
     (folder / "tiny.toml").write_text(TINY)
-    cg.run(folder / "room", folder / "run", workflow=str(folder / "tiny.toml"))
+    cg.run(folder / "room", folder / "run", recipe=str(folder / "tiny.toml"))
     return folder
 
 
@@ -116,6 +120,53 @@ def test_evaluate_scenes(
     assert all("psnr" in line for line in out.splitlines())
 
 
+def test_other_trainers_find_images_and_model_in_one_folder(place: Path, tmp_path: Path) -> None:
+    """Read it as gsplat does (pycolmap, ``sparse/0`` next to ``images``), and as nerfstudio does."""
+    capture = cg.open_prepared(cg.open_run(place / "run")["ingest"])
+    folder = capture.to_nerfstudio(tmp_path / "data")
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    names = {image.name for image in model.images.values()}
+    assert names == {path.name for path in (folder / "images").iterdir()} and len(names) == 8
+    assert len(model.points3D) == len(capture.points.xyz)
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    placed = {image.name: image.cam_from_world().inverse().matrix() for image in model.images.values()}
+    for frame in frames:
+        pose = np.array(frame["transform_matrix"]) * [1, -1, -1, 1]  # from OpenGL axes
+        assert np.allclose(pose[:3], placed[Path(frame["file_path"]).name], atol=1e-9)
+        assert (folder / frame["file_path"]).is_file() and (frame["w"], frame["h"]) == (96, 54)
+    with pytest.raises(CleargsError):
+        capture.to_nerfstudio(folder)
+
+
+def test_a_capture_as_a_dataset(place: Path) -> None:
+    run = cg.open_run(place / "run")
+    capture = cg.open_prepared(run["ingest"])
+    loader = torch.utils.data.DataLoader(capture.dataset(run["rva"].weights()), batch_size=2)
+    batch = next(iter(loader))
+    assert batch["image"].shape == (2, 3, 54, 96) and batch["image"].dtype == torch.float32
+    assert 0.0 <= float(batch["image"].min()) < float(batch["image"].max()) <= 1.0
+    assert batch["mask"].all() and 0 < float(batch["weight"].min()) <= 1
+    camera = capture.cameras()[int(batch["frame_id"][0])]
+    assert np.allclose(batch["camera_to_world"][0, :3, 3], camera.centre, atol=1e-6)
+
+
+def test_a_scene_to_gsplat_and_back(place: Path) -> None:
+    scene = cg.open_run(place / "run").scene()
+    arguments = scene.to_gsplat()
+    assert float(arguments["scales"].min()) > 0 and 0 < float(arguments["opacities"].max()) < 1
+    camera = next(iter(cg.open_prepared(cg.open_run(place / "run")["ingest"]).cameras().values()))
+    images = [cg.render_view(one, camera).image for one in (scene, cg.Scene.from_gsplat(**arguments))]
+    assert torch.allclose(*images, atol=1e-4) and float(images[0].max()) > 0.2
+
+
+def test_objects_are_short_in_a_notebook(place: Path) -> None:
+    run = cg.open_run(place / "run")
+    capture, scene = cg.open_prepared(run["ingest"]), run.scene()
+    for found in (run, run["rva"], capture, scene, scene.gaussians):
+        assert len(repr(found)) < 300 and "tensor(" not in repr(found)
+    assert run._repr_html_().count("<tr>") == 6
+
+
 def test_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run all cells in order, without Jupyter."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
@@ -123,7 +174,7 @@ def test_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     names: dict[str, object] = {}
     exec(code[0], names)
-    names.update(CAPTURE=place / "room", RUN=place / "run", WORKFLOW=str(place / "tiny.toml"))
+    names.update(CAPTURE=place / "room", RUN=place / "run", RECIPE=str(place / "tiny.toml"))
     for cell in code[1:]:
         exec(cell, names)
     assert isinstance(names["scene"], cg.Scene)

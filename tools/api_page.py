@@ -6,7 +6,9 @@ import ast
 import inspect
 import re
 from collections.abc import Iterator
+from importlib import import_module
 from textwrap import dedent
+from types import ModuleType
 
 from pydantic import BaseModel
 
@@ -15,30 +17,69 @@ import cleargs
 INTRODUCTION = """\
 # The library
 
-`import cleargs as cg` gives programs the functions of the command line, {count} names in all. The import is
-fast: modules load on first use, and training loads neither pycolmap nor OpenImageIO. Start from the scripts
-in `examples/`.
+`import cleargs as cg` gives programs the functions of the command line. The import is fast: modules load on
+first use. More scripts are in `examples/`.
+
+```python
+import cleargs as cg
+
+run = cg.run("walk.mp4", quality="draft", progress=print)   # the folder walk, as `cleargs run walk.mp4`
+print(run["rva"].table("frames").select(["name", "role", "weight"]))
+
+scene = run.scene()                                          # Gaussians and rendering options
+capture = cg.open_prepared(run["ingest"])                    # frames, cameras, sparse points
+image = cg.render_view(scene, capture.cameras()[0]).image    # [H, W, 3]
+
+cg.export(run, "walk.ply", up="z", sh_degree=3)              # for Blender
+cg.film(run, "walk.mp4", seconds=6)                          # along the path of the capture
+print(cg.evaluate_scene(run, "room/truth/observed").means)   # against sharp images
+
+gsplat.rasterization(**scene.to_gsplat(), ...)               # other programs: gsplat,
+capture.to_nerfstudio("for-gsplat")                          # trainers that read COLMAP or nerfstudio,
+loader = torch.utils.data.DataLoader(capture.dataset())      # and your own in torch
+```
 
 This page is made from the source: `python -m tools.api_page > docs/api.md`.
 """
 
+RETURNED = (
+    "cleargs.splat.trainer.Trained",
+    "cleargs.splat.types.Render",
+    "cleargs.rivr.distillation.Deblurred",
+    "cleargs.evaluate.eval_report.Evaluation",
+    "cleargs.evaluate.config.EvalOptions",
+    "cleargs.capture.tables.Frame",
+    "cleargs.capture.tables.Points",
+    "cleargs.splat.views.ViewDataset",
+    "cleargs.render.export.ExportOptions",
+    "cleargs.render.shots.ShotOptions",
+)
+"""Types of arguments and results that are not in ``cleargs.__all__``."""
+
 
 def page() -> str:
     """Return the page, with names in the order of ``cleargs.__all__``."""
-    sections = (section(name) for name in cleargs.__all__)
-    return "\n".join([INTRODUCTION.format(count=len(cleargs.__all__)), *sections])
+    sections = [section(name) for name in cleargs.__all__]
+    returned = [section(name.rpartition(".")[2], import_module(name.rpartition(".")[0])) for name in RETURNED]
+    return "\n".join([INTRODUCTION, *sections, "# Types of arguments and results\n", *returned])
 
 
-def section(name: str) -> str:
-    """Return heading, signature and docstring of one name; for a class, also its fields and methods."""
-    found = getattr(cleargs, name)
+def section(name: str, home: ModuleType = cleargs) -> str:
+    """Return heading, signature and docstring of a name; for a class, also its fields and methods."""
+    found = getattr(home, name)
     source = inspect.getsource(found).splitlines()
     node = ast.parse("\n".join(source)).body[0]
     lines = [f"## {name}", "", *_text(found), ""]
     if isinstance(node, ast.FunctionDef):
         lines[2:2] = _code([_signature(node, source)])
-    elif issubclass(found, BaseModel):
+    elif issubclass(found, BaseModel) and home is cleargs:
         lines += ["Its fields are settings: [settings.md](settings.md).", ""]
+    elif issubclass(found, BaseModel):
+        lines += [
+            f"* `{field}`: {facts.description or ''}".rstrip(": ")
+            for field, facts in found.model_fields.items()
+        ]
+        lines.append("")
     elif isinstance(node, ast.ClassDef):
         fields = [item for item in node.body if isinstance(item, ast.AnnAssign)]
         if fields:

@@ -9,7 +9,7 @@ INTRODUCTION = """\
 # Settings
 
 All settings of the five stages, as in `cleargs settings`. Change one with
-`cleargs run INPUT -o RUN --set g0.steps=4000`, or several in a TOML file with `--workflow FILE.toml`. The
+`cleargs run INPUT -o RUN --set g0.steps=4000`, or several in a TOML file with `--recipe FILE.toml`. The
 settings of a run are stored in `RUN/run.toml` and apply until you change them. `seed` (default 0) is global.
 
 This page is made from the source: `python -m tools.settings_page > docs/settings.md`.

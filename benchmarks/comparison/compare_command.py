@@ -18,6 +18,7 @@ from cleargs.cli.common import (
     quality_option,
     quiet_option,
     report_option,
+    with_shortcuts,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -122,7 +123,7 @@ def compare(
     lpips: tuple[LpipsNet, ...],
     workflow: str,
     overrides: tuple[str, ...],
-    quality: tuple[str, ...],
+    quality: str | None,
     wants_report: bool,
     device: DeviceChoice,
     threads: int,
@@ -158,7 +159,8 @@ def compare(
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=lpips, scorers=SCORERS)
     place = resolve_device(device, reporter.info)
-    recipe = SceneRecipe(dag, workflow, (*quality, *overrides), place, threads, options, steps)
+    settings = with_shortcuts(overrides, {"quality": quality})
+    recipe = SceneRecipe(dag, workflow, settings, place, threads, options, steps)
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             _check_names([run.resolve().name for run in runs], "runs")

@@ -80,6 +80,7 @@ def evidence(
         read_evidence,
     )
     from benchmarks.comparison.origin import version_of_source
+    from benchmarks.comparison.real import table_of, with_table
     from benchmarks.comparison.results_page import Origin, results_page
     from benchmarks.comparison.saved_sections import read_sections, save_section
     from benchmarks.comparison.scenes import SceneRecipe
@@ -112,7 +113,10 @@ def evidence(
             _write_pictures(found, context, results)
             save_section(results, found, version, machine)
             kept = read_sections(results, origin.sections, reporter)
-            write_bytes(page, results_page(kept, origin).encode())
+            text = results_page(kept, origin)
+            if page.exists() and (real := table_of(page.read_text(encoding="utf-8"))):
+                text = with_table(text, real)
+            write_bytes(page, text.encode())
             complete = complete and not found.missing
     click.echo(f"written: {page}")
     return 0 if complete else DONE_IN_PART

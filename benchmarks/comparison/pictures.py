@@ -133,11 +133,11 @@ def comparison_sheet(
         capture = captures[first.sample]
         name = _typical_frame(out, first, capture)
         tiles = [
-            Tile(_find_image(capture / "truth" / "observed" / "images", name), f"{column}: truth of {name}"),
-            Tile(_find_image(capture / "images", name), "input"),
+            Tile(find_image(capture / "truth" / "observed" / "images", name), f"{column}: truth of {name}"),
+            Tile(find_image(capture / "images", name), "input"),
         ]
         for variant, cell in shown.items():
-            tiles.append(Tile(_find_image(out / cell.evaluation, name), labels[variant]))
+            tiles.append(Tile(find_image(out / cell.evaluation, name), labels[variant]))
         rows.append([tile for tile in tiles if tile.image is not None])
     write_rgb(path, contact_sheet(rows, tile_width=320))
 
@@ -152,7 +152,7 @@ def _typical_frame(out: Path, cell: Cell, capture: Path) -> str:
     evaluation = Evaluation.model_validate_json((out / cell.evaluation / "eval.json").read_bytes())
     errors = {}
     for image in evaluation.images:
-        sharp, seen = _find_image(truth, image.name), _find_image(observed, image.name)
+        sharp, seen = find_image(truth, image.name), find_image(observed, image.name)
         if sharp is not None and seen is not None and sharp.shape == seen.shape:
             errors[image.name] = float(np.square(sharp - seen).mean(dtype=np.float64))
         else:
@@ -161,7 +161,7 @@ def _typical_frame(out: Path, cell: Cell, capture: Path) -> str:
     return ordered[3 * len(ordered) // 4]
 
 
-def _find_image(folder: Path, stem: str) -> ImageF32 | None:
+def find_image(folder: Path, stem: str) -> ImageF32 | None:
     """Return the image with this stem as float32 sRGB in [0, 1]; None if it does not exist."""
     found = [path for path in image_files(folder) if path.stem == stem] if folder.is_dir() else []
     return read_rgb_float(max(found)) if found else None

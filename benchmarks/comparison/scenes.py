@@ -52,10 +52,12 @@ class Sample:
     seed: int
     reference: Path | None
     """Reference images that the user gave; None for the capture's truth or held-out frames."""
+    label: str = ""
+    """Name in tables; empty for that of the capture."""
 
     @property
     def name(self) -> str:
-        return f"{self.capture.resolve().name}-{self.seed}"
+        return f"{self.label or self.capture.resolve().name}-{self.seed}"
 
     @property
     def column(self) -> str:
@@ -64,7 +66,7 @@ class Sample:
             note = read_json(self.capture / "truth" / "capture.json")
             return str(note["protocol"])
         except (OSError, ValueError, KeyError, TypeError):
-            return capture_name(self.capture)
+            return self.label or capture_name(self.capture)
 
 
 @dataclass(frozen=True)

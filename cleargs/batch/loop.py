@@ -4,6 +4,7 @@
 
     BATCH/scenes/NAME/       run folders, as `cleargs run` makes them
     BATCH/store/             one store for all scenes: equal results are shared
+    BATCH/exports/           exported scenes and films, where the sheet asks for them
     BATCH/logs/NAME.log      the output of the last attempt
     BATCH/summary.csv        one row per scene
     BATCH/report/index.html  a page with all scenes
@@ -14,7 +15,7 @@ from __future__ import annotations
 import csv
 import io
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -27,10 +28,11 @@ from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import Device, RunMetadata, RunSpec, read_metadata
+from cleargs.pipeline.run_file import SCENE, Device, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
+from cleargs.render import TARGETS
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
 from cleargs.subprocesses import module_command
@@ -105,7 +107,7 @@ class Batch:
         device = "auto" if self.falls_back else self.device
         return [
             *("run", str(scene.source), "-o", str(self.run_folder(scene)), "--store", str(self._store)),
-            *("--workflow", scene.recipe, *settings, *until, "--device", device, *self.options),
+            *("--recipe", scene.recipe, *settings, *until, "--device", device, *self.options),
         ]
 
     def check(self, sheet: Path) -> None:
@@ -121,6 +123,10 @@ class Batch:
                     check_same_input(run, self.dag, store)
                 for stage in self.dag.until(self.until)[1:]:  # the first one's files are the capture
                     self.dag.load(stage).externals(run.config.effective[stage], run.source)
+                for ending in set(scene.after.export) - set(TARGETS):
+                    from cleargs.splat.formats import format_of  # loads torch
+
+                    format_of(Path(f"{scene.name}.{ending}"))
             except InputError as error:
                 problems.append(f"{scene.where}: {error}; {error.hint}")
         if problems:
@@ -133,14 +139,46 @@ class Batch:
             return Planner(self.dag, run, store, usable_cores(), SilentReporter()).plan(self.until)
 
     def run(self, scene: SceneJob, reporter: Reporter) -> None:
-        """Run ``scene`` in a separate process, and copy its output to its log and to ``reporter``."""
-        log = self.log(scene)
-        log.parent.mkdir(parents=True, exist_ok=True)
-        command = [*program(), *self.arguments(scene)]
+        """Run ``scene`` and the work after it, each in a separate process. `log` gets their output."""
+        self.log(scene).parent.mkdir(parents=True, exist_ok=True)
+        self.log(scene).write_text("", "utf-8")
+        if self._call(scene, self.arguments(scene), reporter) == 0:
+            for arguments in self.arguments_after(scene):
+                self.exports.mkdir(exist_ok=True)
+                self._call(scene, arguments, reporter, self.exports)
+
+    def arguments_after(self, scene: SceneJob) -> Iterator[list[str]]:
+        """Yield the arguments of ``cleargs`` for the work after ``scene`` that is missing or out of date."""
+        run, name, after = self.run_folder(scene), scene.name, scene.after
+        made = run / SCENE
+        wanted = [
+            (f"{name}.{kind}", ["export", str(run), "-o", f"{name}.{kind}", "--force"])
+            if kind not in TARGETS
+            else (f"{name}-{kind}.*", ["export", str(run), "--for", kind, "--force"])
+            for kind in after.export
+        ]
+        if after.render is not None:
+            turn = ["--turntable"] if after.render == "turntable" else []
+            wanted.append((f"{name}.mp4", ["render", str(run), "-o", f"{name}.mp4", "--force", *turn]))
+        for pattern, arguments in wanted if made.is_file() else ():
+            ages = [file.stat().st_mtime for file in self.exports.glob(pattern)]
+            if not ages or min(ages) < made.stat().st_mtime:
+                yield arguments
+
+    @property
+    def exports(self) -> Path:
+        """Folder of exported scenes and films."""
+        return self.folder / "exports"
+
+    def _call(
+        self, scene: SceneJob, arguments: Sequence[str], reporter: Reporter, folder: Path | None = None
+    ) -> int:
+        """Run ``cleargs`` in ``folder``, and copy its output to the log and to ``reporter``."""
         with (
-            log.open("w", encoding="utf-8") as file,
+            self.log(scene).open("a", encoding="utf-8") as file,
             subprocess.Popen(
-                command,
+                [*program(), *arguments],
+                cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -159,6 +197,7 @@ class Batch:
                 raise
             if child.wait() < 0:
                 file.write(f"error: ended by signal {-child.returncode}\n")
+            return child.returncode
 
     def result(self, scene: SceneJob) -> Result:
         """Return the present state and figures of ``scene``."""
@@ -184,11 +223,11 @@ class Batch:
         except CleargsError as error:
             return "failed", str(error)
         unfinished = next((plan for plan in plans if plan.state != "done"), None)
-        if unfinished is None:
+        if unfinished is None and not any(self.arguments_after(scene)):
             last = plans[-1].manifest
             missing = last.inherited if last is not None else ()
             return ("partial", "; ".join(missing)) if missing else ("done", "")
-        if unfinished.state == "partial":
+        if unfinished is not None and unfinished.state == "partial":
             return "partial", "; ".join(unfinished.reasons)
         with suppress(OSError):  # no attempt yet
             lines = self.log(scene).read_text("utf-8", "replace").splitlines()
@@ -201,7 +240,7 @@ class Batch:
             self.dag,
             scene.source,
             self.run_folder(scene),
-            workflow=scene.recipe,
+            recipe=scene.recipe,
             overrides=(*self.overrides, *scene.overrides),
             store=self._store,
             device="cpu",

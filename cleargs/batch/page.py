@@ -78,7 +78,7 @@ def _picture(
     run: Path, made: Mapping[str, Manifest], report: Path, name: str, side: int
 ) -> tuple[ImageFile | None, str]:
     """Return a picture, and a label for it: the still of the scene's report, or else the first frame."""
-    still = run / FOLDER / "after.jpg"
+    still = run / FOLDER / "scene.jpg"
     try:
         if still.is_file():
             return write_jpeg(report, name, read_rgb(still), side), "the scene"

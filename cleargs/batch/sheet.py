@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, ValidationError
 
@@ -34,6 +34,15 @@ class SheetError(InputError):
         self.problems = problems
 
 
+class After(FrozenModel):
+    """Work on a scene after its last stage: the table ``[after]`` of a sheet, or of one scene in it."""
+
+    export: tuple[str, ...] = ()
+    """Endings of files, and programs of ``cleargs export --for``; the files are written to BATCH/exports."""
+    render: Literal["path", "turntable"] | None = None
+    """The film BATCH/exports/NAME.mp4."""
+
+
 class SheetRow(FrozenModel):
     """A scene as it is in the sheet, with the defaults of the sheet filled in."""
 
@@ -44,6 +53,7 @@ class SheetRow(FrozenModel):
     recipe: str = "default"
     set: dict[str, str] = Field({})
     """Setting -> its value as TOML."""
+    after: After = After()
 
 
 @dataclass(frozen=True)
@@ -59,6 +69,7 @@ class SceneJob:
     """Settings in the form of ``--set``."""
     where: str
     """Place in the sheet, for messages."""
+    after: After = field(default_factory=After)
 
 
 def read_scenes(path: Path) -> list[SceneJob]:
@@ -88,7 +99,7 @@ def read_scenes(path: Path) -> list[SceneJob]:
             problems.append(f"{where}: {scenes[row.name].where} already has the name {row.name!r}")
         recipe = str(folder / row.recipe) if row.recipe.endswith(".toml") else row.recipe
         overrides = tuple(f"{name}={value}" for name, value in row.set.items())
-        scenes[row.name] = SceneJob(row.name, folder / row.input, recipe, overrides, where)
+        scenes[row.name] = SceneJob(row.name, folder / row.input, recipe, overrides, where, row.after)
     if problems:
         raise SheetError(path, problems)
     if not scenes:

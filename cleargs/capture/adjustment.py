@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.judging import CAPPED_PX, epipolar_errors, keep_out
-from cleargs.capture.matching import copy_without_features
+from cleargs.capture.database import copy_without_features
+from cleargs.capture.judging import epipolar_errors, keep_out
 
 FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
 """Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
@@ -25,9 +25,12 @@ _TOLERANCE = 1e-5
 """Relative change of the cost at which an adjustment ends. COLMAP's 0 takes three times as long for the same
 poses."""
 
-_LENS_GAIN = 0.02
+_LENS_GAIN = 0.04
 """`FULL_LENS` is taken where it lowers the mean error of the matches that were kept out by at least this
-share. Lenses that one radial term describes gain 0.000 to 0.010, that of a wide camera 0.073."""
+share (docs/experiments/poses.md)."""
+
+_CAPPED_PX = 4.0
+"""Errors count up to this in means: COLMAP takes a match for right within 4 px of its epipolar line."""
 
 _HELD_BY = 15
 """Fewest points that a frame must see to take part in an adjustment."""
@@ -44,11 +47,11 @@ class Adjuster:
     ) -> None:
         """Copy ``database`` without the tracks that are kept out.
 
+        ``floor`` is the `median_error` if each pair of frames has a separate geometry.
+
         Args:
             database: features and verified matches; it stays as it is.
             triangulate: gives a model new points, from the matches in a database.
-
-        ``floor`` is the `median_error` if each pair of frames has a separate geometry.
         """
         self._cut = database.with_name(f"{database.stem}-cut.db")
         copy_without_features(database, self._cut, [])
@@ -67,8 +70,12 @@ class Adjuster:
 
     def median_error(self, model: pycolmap.Reconstruction) -> float:
         """Return the median of `errors`; 0 where no match was kept out."""
-        errors = self.errors(model)
-        return float(np.median(errors)) if len(errors) else 0.0
+        return _median(self.errors(model))
+
+    def mean_error(self, model: pycolmap.Reconstruction) -> float:
+        """Return the mean of `errors` up to `_CAPPED_PX`, which counts single frames that are wrong, too."""
+        errors = np.minimum(self.errors(model), _CAPPED_PX)
+        return float(errors.sum() / max(1, len(errors)))
 
     def refine(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction | None:
         """Return ``model`` with poses, points and, with ``cameras``, lenses adjusted.
@@ -103,8 +110,8 @@ class Adjuster:
         full = copy.deepcopy(model)
         set_lens(full, FULL_LENS)
         full = self._adjusted(full, cameras=True)
-        before, after = (np.minimum(self.errors(each), CAPPED_PX).sum() for each in (model, full))
-        return full if after < (1 - _LENS_GAIN) * before and _held(full) else model
+        better = self.mean_error(full) < (1 - _LENS_GAIN) * self.mean_error(model)
+        return full if better and _held(full) else model
 
     def _adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
         options = pycolmap.BundleAdjustmentOptions(
@@ -142,8 +149,11 @@ def _has_first_lens(model: pycolmap.Reconstruction) -> bool:
 
 def median_residual(model: pycolmap.Reconstruction) -> float:
     """Return the median over the points of their mean reprojection error, px; 0 without any point."""
-    errors = [point.error for point in model.points3D.values()]
-    return float(np.median(errors)) if errors else 0.0
+    return _median(np.array([point.error for point in model.points3D.values()]))
+
+
+def _median(errors: NDArray[np.float64]) -> float:
+    return float(np.median(errors)) if len(errors) else 0.0
 
 
 def lay_over(
@@ -151,24 +161,20 @@ def lay_over(
 ) -> None:
     """Lay ``model`` over the cameras of ``given`` by the similarity that fits its images ``held`` best.
 
-    The size follows from how far the centres spread. The turn follows from centres and axes together, as the
-    centres of a straight path leave the turn about it open (Kabsch 1976).
+    The axes count too, as the centres of a straight path leave the turn about it open.
     """
-    before = {image.name: image for image in given.images.values() if image.has_pose}
-    found, known = [_camera(image) for image in held], [_camera(before[image.name]) for image in held]
-    ours, theirs = (np.stack([centre for centre, _ in cameras]) for cameras in (found, known))
-    ours_mean, theirs_mean = ours.mean(axis=0), theirs.mean(axis=0)
-    a, b = ours - ours_mean, theirs - theirs_mean
-    spread = float(np.linalg.norm(a))
-    scale = float(np.linalg.norm(b)) / spread if spread > 0 else 1.0
-    product = scale * a.T @ b + sum(
-        mine.T @ other for (_, mine), (_, other) in zip(found, known, strict=True)
-    )
-    u, _, vt = np.linalg.svd(product)
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = (u @ mirror @ vt).T
-    shift = theirs_mean - scale * turn @ ours_mean
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), shift))
+    before = {image.name: image for image in given.images.values()}
+    found = pycolmap.estimate_sim3d(_marks(held), _marks([before[image.name] for image in held]))
+    assert found is not None  # four marks of a camera fix one
+    model.transform(found)
+
+
+def _marks(images: Collection[pycolmap.Image]) -> NDArray[np.float64]:
+    """Return the centres of cameras, and the points one scene's size along their axes, [4 N, 3]."""
+    centres = np.stack([image.projection_center() for image in images])
+    size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    axes = np.stack([image.cam_from_world().rotation.matrix() for image in images])
+    return np.concatenate([centres, (centres[:, None] + size * axes).reshape(-1, 3)])
 
 
 def _held(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
@@ -189,8 +195,3 @@ def _anchored(
         if image.has_pose and image.name not in names:
             model.frames[image.frame_id].rig_from_world = pycolmap.Rigid3d(poses[image.name].matrix())
     return model
-
-
-def _camera(image: pycolmap.Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where a camera is, [3], and its axes in the world, one per row, [3, 3]."""
-    return np.asarray(image.projection_center()), np.asarray(image.cam_from_world().rotation.matrix())

@@ -22,13 +22,11 @@ from cleargs.media import MAX_PIXELS
 if TYPE_CHECKING:
     from cleargs.capture.colmap import pycolmap
 
-SINGLE_FOCAL = frozenset(
-    {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_FISHEYE = frozenset(
+    {"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FOV"}
 )
-"""Models with one focal length: f, cx, cy, ..."""
-
-TWO_FOCALS = frozenset({"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE", "FOV"})
-"""Models with two: fx, fy, cx, cy, ..."""
+_MODELS = _FISHEYE | {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+"""COLMAP models that are supported; those of `_FISHEYE` bend lines even without distortion."""
 
 MAX_PARAMETER, MIN_FOCAL = 1e9, 1e-3
 """Largest camera parameter, and shortest focal length in pixels. Beyond them pixels and rays overflow."""
@@ -54,45 +52,39 @@ class Intrinsics:
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if self.model not in SINGLE_FOCAL | TWO_FOCALS:
+        if self.model not in _MODELS:
             raise InputError(
                 f"camera model {self.model} is not supported",
                 hint="undistort the images first, or use a perspective or OpenCV fisheye model",
             )
+        fault = ""
         if not np.isfinite(self.params).all() or np.abs(self.params).max(initial=0.0) > MAX_PARAMETER:
-            raise InputError(
-                "a camera has parameters that are not finite, or that no lens has",
-                hint="correct the camera in the input",
-            )
-        if min(self.width, self.height) < 1:
-            raise InputError("a camera has images without pixels", hint="correct the camera in the input")
-        if self.width * self.height > MAX_PIXELS:
-            raise InputError(
-                f"a camera has more than {MAX_PIXELS} pixels",
-                hint="correct the camera in the input, or reduce its images",
-            )
-        if not self.colmap().verify_params() or min(self.focal) < MIN_FOCAL:
-            raise InputError(
-                f"a {self.model} camera has a wrong number of parameters or a focal length of 0 or less",
-                hint="correct the camera in the input",
-            )
+            fault = "a camera has parameters that are not finite, or that no lens has"
+        elif min(self.width, self.height) < 1:
+            fault = "a camera has images without pixels"
+        elif self.width * self.height > MAX_PIXELS:
+            fault = f"a camera has more than {MAX_PIXELS} pixels"
+        elif not self.colmap().verify_params() or min(self.focal) < MIN_FOCAL:
+            fault = f"a {self.model} camera has a wrong number of parameters or a focal length of 0 or less"
+        if fault:
+            raise InputError(fault, hint="correct the camera in the input")
 
     @property
     def focal(self) -> tuple[float, float]:
         """Focal lengths fx and fy, px."""
-        return (self.params[0],) * 2 if self.model in SINGLE_FOCAL else (self.params[0], self.params[1])
+        camera = self.colmap()
+        return camera.focal_length_x, camera.focal_length_y
 
     @property
     def centre(self) -> tuple[float, float]:
         """Principal point cx and cy, px."""
-        start = 1 if self.model in SINGLE_FOCAL else 2
-        return self.params[start], self.params[start + 1]
+        camera = self.colmap()
+        return camera.principal_point_x, camera.principal_point_y
 
     @property
     def is_pinhole(self) -> bool:
         """Return True if the image needs no undistortion."""
-        distortion = self.params[3:] if self.model in SINGLE_FOCAL else self.params[4:]
-        return not any(distortion) and not self.model.endswith("FISHEYE") and self.model != "FOV"
+        return self.model not in _FISHEYE and bool(self.colmap().is_undistorted())
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """Return the camera of the same image scaled to another size."""
@@ -171,12 +163,7 @@ def rigid_pose(camera_to_world: NDArray[np.float64], name: str, hint: str) -> Po
     """Return the pose of a camera-to-world matrix with OpenGL axes (x right, y up, z back).
 
     Printed poses are orthonormal to a few digits only, and some writers leave a scale in. The nearest
-    rotation is taken.
-
-    Args:
-        camera_to_world: matrix [3 or 4, 4] in the input's units.
-        name: name of the frame, for the error.
-        hint: remedy, for the error.
+    rotation is taken. ``name`` of the frame and ``hint`` are for the error.
 
     Raises:
         InputError: NaN, a coordinate above `MAX_COORDINATE`, a mirror image, or axes whose lengths differ by
@@ -272,11 +259,5 @@ def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
     if length < 1e-6:
         return np.eye(3)
     before = _FLIP if up[1] > 0.5 * length else np.eye(3)
-    direction = before @ up / length
-    target = np.array([0.0, -1.0, 0.0])
-    axis = np.cross(direction, target)
-    sine = float(np.linalg.norm(axis))
-    angle = float(np.arctan2(sine, direction @ target))
-    turn = Rotation.from_rotvec(axis / sine * angle).as_matrix() if sine > 0 else np.eye(3)
-    rotation: NDArray[np.float64] = turn @ before
-    return rotation
+    turn, _ = Rotation.align_vectors([[0.0, -1.0, 0.0]], [before @ up / length])
+    return np.asarray(turn.as_matrix() @ before)

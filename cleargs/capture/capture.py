@@ -64,16 +64,12 @@ class Layout(Protocol):
     """
 
     def detect(self, source: Path, *, poses: bool) -> bool:
-        """Return True if the input at ``source`` has this layout.
-
-        Looks at names only. Without ``poses``, files of poses do not count.
-        """
+        """Return True if ``source`` has this layout, by names. Without ``poses``, no file of poses counts."""
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:
         """Return all files that are read, by role: a file, a folder, or single files by name.
 
-        Looks at names only and imports nothing heavy, because the runner calls it for every run, even if
-        there is nothing to do. `open_capture` reports a missing input.
+        Imports nothing heavy: the runner calls it for every run. `open_capture` reports a missing input.
         """
 
     def open_capture(self, source: Path, config: CaptureConfig) -> Capture:

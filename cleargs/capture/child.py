@@ -51,16 +51,14 @@ def _die_with_parent() -> None:
 def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
     """Run ``python -P -m module job`` to its end, showing its progress.
 
-    Raises StageError with the child's own cause, or with the last failed check in ``log`` when it aborted;
-    StoreError where the disk is full.
-    Whatever ends this call early (Ctrl-C above all) kills the child, and what it started, first.
+    If this call ends early (Ctrl-C above all), the child and what it started are killed first.
+
+    Raises:
+        StageError: with the child's cause, or with the last failed check in ``log`` when it aborted.
+        StoreError: the disk is full.
     """
-    # Sums in COLMAP's and numpy's linear algebra must not depend on threads. Features of several frames at a
-    # time are found by threads of COLMAP's own, matches by processes, as many as the job says.
-    environment = {
-        **os.environ,
-        **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
-    }
+    # Sums in COLMAP's and numpy's linear algebra must not depend on threads.
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     with (
         log.open("w", encoding="utf-8") as errors,
         subprocess.Popen(
@@ -68,7 +66,7 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
-            env=environment,
+            env={**os.environ, **single},
             text=True,
             start_new_session=True,
         ) as child,

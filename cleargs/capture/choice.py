@@ -32,20 +32,17 @@ _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> Capture:
     """Return ``capture`` with each frame of a video exchanged for the sharpest of its stretch of time.
 
-    The stretch of a frame is all frames of its video that are nearer to its time than to the time of another
-    chosen frame. Ties go to the earlier one. Each video is decoded once, unless a killed run left its choice
-    in ``folder``.
+    The stretch of a frame is all frames that are nearer to its time than to that of another. Ties go to the
+    earlier one. Each video is decoded once, unless a killed run left its choice in ``folder``.
     """
     if capture.kind != "video":
         return capture
-    videos = list(dict.fromkeys(frame.path for frame in capture.frames))
     frames: list[SourceFrame] = []
-    for number, video in enumerate(videos):
+    for number, video in enumerate(dict.fromkeys(frame.path for frame in capture.frames)):
         ours = [frame for frame in capture.frames if frame.path == video]
         file = folder / (CHOICE if number == 0 else f"{number}-{CHOICE}")
         frames += _sharpest_of(video, ours, capture.stretch, file, long_side, reporter)
-    same = all(one is two for one, two in zip(frames, capture.frames, strict=True))
-    return capture if same else replace(capture, frames=tuple(frames))
+    return replace(capture, frames=tuple(frames))
 
 
 def _sharpest_of(
@@ -97,8 +94,7 @@ def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
     """Variance of the Laplacian of the grey image after a binomial filter (5x5, sigma 1 px); 0 and up.
 
     It grows with the texture in view too, so it ranks neighbours, not a whole capture. Unfiltered it would
-    rank noise first: of a frame and its blurred copy with noise of 4 levels, it takes the copy more often
-    than not. All values are whole numbers below 2^24, so the sums are exact.
+    rank noise first. All values are whole numbers below 2^24, so the sums are exact.
     """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     smooth = cv2.sepFilter2D(grey, cv2.CV_32F, _BINOMIAL, _BINOMIAL)
@@ -114,22 +110,14 @@ def held_out(
     """Return the numbers of the test frames by ``ingest.holdout``.
 
     every:N holds out frames 0, N, 2N, ..., as Mip-NeRF 360 and 3DGS do with N = 8. sharpest:N holds out the
-    sharpest of every N registered frames in a row, also of the shorter rest, as 3dgs-deblur's
-    ``train_eval_split_by_blur_score.py`` does with N = 8 and blur scores of the recording. Tests are then
-    sharp and spread over the capture. Ties go to the earlier frame.
-
-    Args:
-        rule: the setting.
-        names: names of the frames.
-        read: returns frame i as RGB, for sharpest:N.
-        registered: true for each frame with a pose.
+    sharpest of every N ``registered`` frames in a row, also of the shorter rest, as 3dgs-deblur's
+    ``train_eval_split_by_blur_score.py`` does; ``read`` gives their images. Ties go to the earlier frame.
 
     Raises:
         InputError: unknown names, or no registered frame is left for training.
     """
     kind, _, number = rule.partition(":")
-    if rule == "none":
-        return set()
+    chosen: set[int] = set()
     if kind == "every":
         chosen = set(range(0, len(names), int(number)))
     elif kind == "sharpest":
@@ -137,8 +125,8 @@ def held_out(
         candidates = [index for index in range(len(names)) if registered[index]]
         stretches = [candidates[start : start + period] for start in range(0, len(candidates), period)]
         chosen = {max(stretch, key=lambda index: sharpness(read(index))) for stretch in stretches}
-    else:
-        items = [item.strip() for item in rule.split(",") if item.strip()]
+    elif rule != "none":
+        items = filter(None, map(str.strip, rule.split(",")))
         chosen = {index for item in items for index in _matching(item, names)}
     if not any(flag and index not in chosen for index, flag in enumerate(registered)):
         raise InputError(f"ingest.holdout={rule} leaves no frame to train on", hint="hold out fewer frames")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
@@ -21,12 +21,11 @@ def image_folders(root: Path) -> list[Path]:
 
     LLFF and nerfstudio name images that are N times smaller so.
     """
-    found = [(0, root / "images")] if (root / "images").is_dir() else []
+    factors = {root / "images": 0}
     for folder in root.glob("images_*"):
-        factor = folder.name.removeprefix("images_")
-        if factor.isdecimal() and folder.is_dir():
-            found.append((int(factor), folder))
-    return [folder for _, folder in sorted(found)]
+        if (factor := folder.name.removeprefix("images_")).isdecimal():
+            factors[folder] = int(factor)
+    return [folder for folder in sorted(factors, key=lambda folder: factors[folder]) if folder.is_dir()]
 
 
 def image_files(folder: Path, *, below: bool = False) -> list[Path]:
@@ -34,34 +33,30 @@ def image_files(folder: Path, *, below: bool = False) -> list[Path]:
 
     ``below`` includes those in its subfolders.
     """
-    found = folder.rglob("*") if below else folder.iterdir()
+    return _files(folder, IMAGE_SUFFIXES, below=below)
+
+
+def _files(folder: Path, suffixes: Collection[str], *, below: bool = False) -> list[Path]:
     return [
         path
-        for path in found
-        if path.suffix.lower() in IMAGE_SUFFIXES
+        for path in (folder.rglob("*") if below else folder.iterdir())
+        if path.suffix.lower() in suffixes
         and path.is_file()
         and is_inside(path.relative_to(folder).as_posix())
     ]
 
 
 def folder_of_images(root: Path) -> Path | None:
-    """Return the first folder that holds any image of ``images/``, ``root`` itself, and the reductions.
-
-    The largest reduction comes first. None if no folder has images.
-    """
+    """Return the first of ``images/``, ``root`` itself and the reductions that holds images, or None."""
     folders = [root / "images", root, *image_folders(root)]
     return next((folder for folder in folders if folder.is_dir() and image_files(folder)), None)
 
 
 def folders_to_search(root: Path) -> list[Path]:
-    """Return the folders that may hold the images of a listing.
-
-    They are ``images/``, its reductions, other folders, and ``root``. Masks and folders without images are
-    left out.
-    """
-    named = image_folders(root)
+    """Return the folders with images: ``images/``, its reductions, others but ``masks/``, and ``root``."""
     others = sorted(path for path in root.iterdir() if path.is_dir() and is_inside(path.name))
-    folders = [*named, *(path for path in others if path not in named and path.name != "masks"), root]
+    folders = dict.fromkeys([*image_folders(root), *others, root])
+    folders.pop(root / "masks", None)
     return [folder for folder in folders if image_files(folder, below=folder != root)]
 
 
@@ -90,12 +85,7 @@ def _spelling(name: str, by_stem: bool) -> str:
 
 
 def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str, ...]:
-    """Return a note on ``missing`` images, or nothing if all exist.
-
-    Args:
-        missing: names of the missing images.
-        total: number of images in the listing.
-        listing: name of the listing, for the note.
+    """Return a note on the ``missing`` of ``total`` images in ``listing``, or nothing if all exist.
 
     Raises:
         InputError: more than half of the images are missing.
@@ -103,45 +93,36 @@ def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str,
     if not missing:
         return ()
     more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+    lost = f"images that do not exist: {', '.join(missing[:3])}{more}"
     if 2 * len(missing) > total:
         raise InputError(
-            f"{listing} lists {len(missing)} images that do not exist: {', '.join(missing[:3])}{more}",
+            f"{listing} lists {len(missing)} {lost}",
             hint="put the images where it says, remove the entries, or set ingest.poses=sfm",
         )
-    return (
-        f"{len(missing)} of {total} images that {listing} lists do not exist: "
-        f"{', '.join(missing[:3])}{more}; they are left out",
-    )
+    return (f"{listing} lists {len(missing)} of {total} {lost}; they are left out",)
 
 
 def videos_in(folder: Path) -> list[Path]:
     """Return the videos in ``folder`` itself, in natural order, without hidden ones."""
-    found = [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and is_inside(path.name)
-    ]
-    return sorted(found, key=lambda path: natural_key(path.name))
+    return sorted(_files(folder, VIDEO_SUFFIXES), key=lambda path: natural_key(path.name))
 
 
 def left_out(folder: Path) -> tuple[str, ...]:
     """Return notes on videos and raw photographs in ``folder``, from which images are read."""
-    videos = [path.name for path in videos_in(folder)]
-    raw = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in RAW_SUFFIXES)
     notes = []
-    if videos:
+    if videos := videos_in(folder):
         notes.append(
             f"{_counted(videos, 'video')} in {folder.name}/ left out, as it holds photographs too; "
             "to take videos, give one as the input, or a folder with videos alone"
         )
-    if raw:
+    if raw := sorted(_files(folder, RAW_SUFFIXES)):
         notes.append(f"{_counted(raw, 'file')} not read: convert raw photographs and GIFs to JPEG or PNG")
     return tuple(notes)
 
 
-def _counted(names: Sequence[str], word: str) -> str:
-    listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    return f"{len(names)} {word}{'' if len(names) == 1 else 's'} ({listed})"
+def _counted(files: Sequence[Path], word: str) -> str:
+    listed = ", ".join(path.name for path in files[:3]) + (", ..." if len(files) > 3 else "")
+    return f"{len(files)} {word}{'' if len(files) == 1 else 's'} ({listed})"
 
 
 def is_inside(name: str) -> bool:
@@ -198,13 +179,9 @@ def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
 def chosen(
     frames: Sequence[SourceFrame], source: Path, at_most: int, names: Sequence[str] | None = None
 ) -> tuple[SourceFrame, ...]:
-    """Return at most ``at_most`` of ``frames``, evenly, with their masks.
+    """Return at most ``at_most`` of ``frames``, evenly, with their masks in the input ``source``.
 
-    Args:
-        frames: all frames. A mask that a frame has stays.
-        source: the input, which may contain a folder of masks.
-        at_most: largest number of frames.
-        names: names by which masks are found; None: those of the frames.
+    Masks are found by ``names``, or those of the frames. A mask that a frame has stays.
     """
     names = [frame.name for frame in frames] if names is None else names
     masks = masks_of(mask_folder(source), names)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,34 +20,27 @@ from cleargs.capture.colmap import pycolmap
 HELD_OUT = 10
 """Every tenth track is kept out."""
 
-CAPPED_PX = 4.0
-"""Errors count up to this: COLMAP takes a match for right within 4 px of its epipolar line."""
-
 _WITH_MATRIX = (
     pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
     pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED,
 )
 """Pairs whose matches fix a fundamental matrix: the scene is not a plane, and the camera moved."""
 
-Matches = dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.float64]]]
+Pixels = NDArray[np.float64]  # [K, 2]
+Matches = dict[tuple[int, int], tuple[Pixels, Pixels]]
 """Pair of image ids -> pixels in the first and in the second image, [K, 2] each."""
 
 
 def verified_matches(database: Path) -> Matches:
     """Return the matches in ``database`` that COLMAP verified."""
     with pycolmap.Database.open(database) as opened:
-        pixels = {
-            image.image_id: np.asarray(opened.read_keypoints(image.image_id), np.float64)[:, :2]
-            for image in opened.read_all_images()
-        }
-        pair_ids, geometries = opened.read_two_view_geometries()
-    found: Matches = {}
-    for pair_id, geometry in zip(pair_ids, geometries, strict=True):
-        one, two = pycolmap.pair_id_to_image_pair(pair_id)
-        rows = np.asarray(geometry.inlier_matches)
-        if len(rows):
-            found[one, two] = pixels[one][rows[:, 0]], pixels[two][rows[:, 1]]
-    return found
+        pixels = _pixels(opened)
+        found = {pair: geometry.inlier_matches for pair, geometry in _geometries(opened).items()}
+    return {
+        (one, two): (pixels[one][rows[:, 0]], pixels[two][rows[:, 1]])
+        for (one, two), rows in found.items()
+        if len(rows)
+    }
 
 
 def keep_out(database: Path) -> tuple[Matches, float]:
@@ -61,40 +55,35 @@ def keep_out(database: Path) -> tuple[Matches, float]:
         pair has one.
     """
     kept_out: Matches = {}
-    alone = []
+    alone = [np.zeros(0)]
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
-        images = sorted(image.image_id for image in opened.read_all_images())
-        pixels = {key: np.asarray(opened.read_keypoints(key), np.float64)[:, :2] for key in images}
-        start = dict(zip(images, np.cumsum([0, *(len(pixels[key]) for key in images)]), strict=False))
-        pair_ids, geometries = opened.read_two_view_geometries()
-        pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
-        rows = [np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2) for geometry in geometries]
-        edges = [
-            row + np.array([start[one], start[two]]) for row, (one, two) in zip(rows, pairs, strict=True)
-        ]
-        tracks = _tracks(edges, sum(map(len, pixels.values())))
-        sizes = np.bincount(tracks)
-        first = np.unique(tracks, return_index=True)[1]  # by which a track is the same in another database
-        owner = np.repeat(images, [len(pixels[key]) for key in images])[first]
+        pixels, geometries = _pixels(opened), _geometries(opened)
+        sizes = [len(xy) for xy in pixels.values()]
+        start = dict(zip(pixels, np.cumsum([0, *sizes]).tolist(), strict=False))
+        edges = {
+            (one, two): np.reshape(geometry.inlier_matches, (-1, 2)).astype(np.int64)
+            + np.array([start[one], start[two]])
+            for (one, two), geometry in geometries.items()
+        }
+        a, b = np.concatenate([np.zeros((0, 2), np.int64), *edges.values()]).T
+        graph = coo_array((np.ones(len(a)), (a, b)), shape=(sum(sizes),) * 2)
+        tracks = connected_components(graph)[1]
+        # By its first feature, a track is the same in another database.
+        first = np.unique(tracks, return_index=True)[1]
+        owner = np.repeat(list(pixels), sizes)[first]
         number = first - np.array([start[key] for key in owner.tolist()], np.int64)
         # Wrong matches join tracks: one of more features than there are images is none.
-        chosen = ((owner + number) % HELD_OUT == 0) & (sizes <= len(images))
-        for geometry, row, edge, (one, two) in zip(geometries, rows, edges, pairs, strict=True):
-            out = chosen[tracks[edge[:, 0]]]
+        chosen = ((owner + number) % HELD_OUT == 0) & (np.bincount(tracks) <= len(pixels))
+        for (one, two), geometry in geometries.items():
+            rows, out = np.asarray(geometry.inlier_matches), chosen[tracks[edges[one, two][:, 0]]]
             if out.any():
-                kept_out[one, two] = first_xy, second_xy = pixels[one][row[out, 0]], pixels[two][row[out, 1]]
+                xy = kept_out[one, two] = pixels[one][rows[out, 0]], pixels[two][rows[out, 1]]
                 if geometry.config in _WITH_MATRIX and geometry.F is not None:
-                    alone.append(_sampson(_homogeneous(first_xy), _homogeneous(second_xy), geometry.F))
-                geometry.inlier_matches = row[~out].astype(np.uint32)
+                    alone.append(_distances(*xy, geometry.F))
+                geometry.inlier_matches = rows[~out]
                 opened.update_two_view_geometry(one, two, geometry)
-    return kept_out, float(np.median(np.concatenate(alone))) if alone else 0.0
-
-
-def _tracks(edges: list[NDArray[np.int64]], features: int) -> NDArray[np.int64]:
-    """Return the number of the track of each feature; ``edges`` are pairs of features."""
-    a, b = np.concatenate([np.zeros((0, 2), np.int64), *edges]).T
-    _, labels = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(features, features)))
-    return np.asarray(labels, np.int64)
+    errors = np.concatenate(alone)
+    return kept_out, float(np.median(errors)) if len(errors) else 0.0
 
 
 def epipolar_errors(
@@ -112,29 +101,24 @@ def epipolar_errors(
         if one not in poses or two not in poses:
             found.append(np.full(len(first), np.inf))
             continue
-        a, b = poses[one], poses[two]
-        rotation = b[:, :3] @ a[:, :3].T
-        x, y, z = b[:, 3] - rotation @ a[:, 3]
-        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-        off = _sampson(_rays(cameras[one], first), _rays(cameras[two], second), essential)
-        focal = 0.5 * (cameras[one].mean_focal_length() + cameras[two].mean_focal_length())
+        second_from_first = pycolmap.Rigid3d(poses[two]) * pycolmap.Rigid3d(poses[one]).inverse()
+        essential = pycolmap.essential_matrix_from_pose(second_from_first)
+        a, b = cameras[one], cameras[two]
+        off = _distances(a.cam_from_img(first), b.cam_from_img(second), essential)
+        focal = 0.5 * (a.mean_focal_length() + b.mean_focal_length())
         found.append(np.where(np.isfinite(off), off * focal, np.inf))
     return np.concatenate(found)
 
 
-def _sampson(
-    p: NDArray[np.float64],  # [K, 3] points of the first image
-    q: NDArray[np.float64],  # [K, 3] of the second
-    matrix: NDArray[np.float64],  # [3, 3], q^T matrix p = 0
-) -> NDArray[np.float64]:
-    to_second, to_first = p @ matrix.T, q @ matrix
-    weight = (to_second[:, :2] ** 2).sum(axis=1) + (to_first[:, :2] ** 2).sum(axis=1)
-    return np.asarray(np.abs((q * to_second).sum(axis=1)) / np.sqrt(np.maximum(weight, 1e-300)))
+def _distances(first: Any, second: Any, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.sqrt(pycolmap.compute_squared_sampson_error(first, second, matrix))
 
 
-def _rays(camera: pycolmap.Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2] -> [K, 3]
-    return _homogeneous(np.asarray(camera.cam_from_img(xy)))
+def _pixels(opened: pycolmap.Database) -> dict[int, Pixels]:
+    images = sorted(image.image_id for image in opened.read_all_images())
+    return {key: np.asarray(opened.read_keypoints(key), np.float64)[:, :2] for key in images}
 
 
-def _homogeneous(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.column_stack([xy, np.ones(len(xy))])
+def _geometries(opened: pycolmap.Database) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+    pair_ids, geometries = opened.read_two_view_geometries()
+    return dict(zip(map(pycolmap.pair_id_to_image_pair, pair_ids), geometries, strict=True))

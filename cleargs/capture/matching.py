@@ -3,16 +3,16 @@
 Pairs are all pairs, or neighbours and distant frames that look alike. No external vocabulary is needed: the
 words are clustered from the capture's own descriptors.
 
-COLMAP's threads do not always find the same matches: with two threads 2 of 76 runs over the same features
-differed (pycolmap 4.2.1), with one thread none of 60. Each process matches blocks of pairs in its own copy of
-the database. Its matches are copied back at the end, or by the next run if this one is killed.
+COLMAP's threads do not always find the same matches (docs/experiments/poses.md). Each process matches blocks
+of pairs in its own copy of the database. Its matches are copied back at the end, or by the next run if this
+one is killed.
 """
 
 from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, suppress
 from functools import partial
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.colmap import pycolmap
+from cleargs.capture.database import is_sound, remove_database
 
 _PAIRS_PER_BLOCK = 200
 """COLMAP indexes the features of a frame again in each block (a tenth of the time),
@@ -34,8 +35,6 @@ N_WORDS = 32
 
 _SAMPLE = 20_000
 _ROUNDS = 8
-_MAX_IMAGES = 2**31 - 1
-"""COLMAP numbers a pair of images by the id of the first, times this, plus that of the second."""
 
 
 def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
@@ -53,17 +52,11 @@ def loop_pairs(
     min_gap: int,
     seed: int,
 ) -> list[tuple[int, int]]:
-    """Return each frame paired with the most similar frames that are at least ``min_gap`` away.
+    """Return each frame paired with the ``candidates`` most similar frames at least ``min_gap`` away.
 
     Similarity is that of VLAD signatures (Jégou et al. 2010): residuals to the nearest word, summed per word,
     signed square root, normalised. Word coordinates are integers, so that all large sums are exact in any
     order.
-
-    Args:
-        descriptors: SIFT descriptors of each frame.
-        candidates: pairs per frame.
-        min_gap: smallest difference of frame numbers.
-        seed: seed of the clustering.
     """
     count = len(descriptors)
     if candidates == 0 or count <= min_gap or not any(len(rows) for rows in descriptors):
@@ -116,17 +109,9 @@ def match_pairs(
     processes: int,
     done: Callable[[int], None],
 ) -> None:
-    """Match and verify the pairs of frames that have no matches in ``database`` yet.
+    """Match and verify the ``pairs`` of frame numbers that have no matches in ``database`` yet.
 
-    The result is the same for any number of processes.
-
-    Args:
-        database: COLMAP's database, which receives the matches.
-        names: names of the images by frame number.
-        pairs: pairs of frame numbers.
-        seed: seed of the verification.
-        processes: number of processes.
-        done: receives the number of finished pairs.
+    The result is the same for any number of ``processes``. ``done`` receives the number of finished pairs.
 
     Raises:
         BrokenProcessPool: a process ended.
@@ -188,54 +173,3 @@ def _gather(database: Path, share: Path) -> None:
         for table in ("matches", "two_view_geometries"):
             opened.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM share.{table}")
         opened.commit()
-
-
-def is_sound(database: Path) -> bool:
-    """Return True if every page of ``database`` is intact. COLMAP would abort at a damaged page."""
-    try:
-        with closing(sqlite3.connect(database)) as opened:
-            return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
-    except sqlite3.Error:
-        return False
-
-
-def remove_database(database: Path) -> None:
-    """Remove the files of ``database``, including SQLite's log of changes."""
-    for leftover in database.parent.glob(f"{database.name}*"):
-        leftover.unlink()
-
-
-def copy_without_features(database: Path, copy: Path, image_ids: Collection[int]) -> None:
-    """Copy COLMAP's ``database`` without the features and matches of these images."""
-    remove_database(copy)
-    listed = ", ".join(str(int(image_id)) for image_id in image_ids)
-    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
-        source.backup(target)
-        for table in ("keypoints", "descriptors"):
-            target.execute(f"DELETE FROM {table} WHERE image_id IN ({listed})")
-        for table in ("matches", "two_view_geometries"):
-            target.execute(
-                f"DELETE FROM {table} WHERE pair_id / {_MAX_IMAGES} IN ({listed}) "
-                f"OR pair_id % {_MAX_IMAGES} IN ({listed})"
-            )
-        target.commit()
-
-
-def why_missing(database: Path, missing: Collection[int]) -> dict[int, str]:
-    """Return the reason why COLMAP found no pose, by image id."""
-    with pycolmap.Database.open(database) as opened:
-        pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
-        features = {image_id: opened.num_keypoints_for_image(image_id) for image_id in missing}
-    matched: set[int] = set()
-    for pair_id, count in zip(pair_ids, inliers, strict=True):
-        pair = pycolmap.pair_id_to_image_pair(pair_id)
-        if count and any(image_id not in features for image_id in pair):
-            matched.update(pair)
-    return {
-        image_id: "too few points in common with placed frames"
-        if image_id in matched
-        else "matches no placed frame"
-        if count
-        else "no features"
-        for image_id, count in features.items()
-    }

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Intrinsics, Pose, within_reach
+from cleargs.capture.cameras import Intrinsics, Pose, Similarity, within_reach
 from cleargs.capture.colmap import pycolmap
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
@@ -58,6 +58,11 @@ class SparseModel:
         ids = self.point_ids[which]
         images = {key: image.select(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
         return replace(self, images=images, point_ids=ids, xyz=self.xyz[which], error=self.error[which])
+
+    def moved(self, similarity: Similarity) -> SparseModel:
+        """Return the model in another world; every point keeps its place in every image."""
+        images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in self.images.items()}
+        return replace(self, images=images, xyz=similarity.points(self.xyz))
 
 
 def read_model(folder: Path) -> SparseModel:
@@ -125,17 +130,8 @@ def transform_model(
     rotation: NDArray[np.float64],  # [3, 3]
     translation: NDArray[np.float64],  # [3]
 ) -> SparseModel:
-    """``model`` under x -> scale rotation x + translation; every point keeps its place in every image."""
-
-    def pose(before: Pose) -> Pose:
-        turned = before.rotation @ rotation.T
-        return Pose(turned, -turned @ (scale * rotation @ before.centre + translation))
-
-    return replace(
-        model,
-        images={key: replace(image, pose=pose(image.pose)) for key, image in model.images.items()},
-        xyz=scale * model.xyz @ rotation.T + translation,
-    )
+    """``model`` under x -> scale rotation x + translation."""
+    return model.moved(Similarity(rotation, -rotation.T @ translation / scale, 1 / scale))
 
 
 def _camera_end(data: bytes, at: int) -> int:

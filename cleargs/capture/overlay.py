@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.media.image import read_rgb
+from cleargs.media.image import image_size, read_rgb
 
 _SAMPLES = 32
 """Pictures that are compared, evenly over the capture."""
@@ -41,17 +41,14 @@ def still_parts(images: Sequence[Path]) -> NDArray[np.uint8] | None:
     chosen = [images[int(index * step)] for index in range(min(len(images), _SAMPLES))]
     if len(chosen) < _FEWEST:
         return None
-    total: NDArray[np.float32] | None = None
-    squares: NDArray[np.float32] | None = None
+    sizes = {image_size(path) for path in chosen}
+    if len(sizes) > 1:
+        return None
+    total, squares = np.zeros((2, *sizes.pop()[::-1]), np.float32)
     for path in chosen:
-        grey = cv2.cvtColor(read_rgb(path), cv2.COLOR_RGB2GRAY).astype(np.float32)
-        if total is None or squares is None:
-            total, squares = np.zeros_like(grey), np.zeros_like(grey)
-        if grey.shape != total.shape:
-            return None
-        total += grey
-        squares += grey * grey
-    assert total is not None and squares is not None
+        grey = cv2.cvtColor(read_rgb(path), cv2.COLOR_RGB2GRAY)
+        cv2.accumulate(grey, total)
+        cv2.accumulateSquare(grey, squares)
     mean = total / len(chosen)
     deviation = np.sqrt(np.maximum(squares / len(chosen) - mean * mean, 0))
     if np.median(deviation) < _MOVES:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,14 +52,8 @@ class WorkFrame:
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
     """Write the working images ``folder/images/%06d.png`` and their masks ``folder/masks/%06d.png.png``.
 
-    The names of masks are COLMAP's. Images are reduced by area averaging in sRGB, never enlarged. Intact
+    The names of masks are COLMAP's. Images are reduced to ``long_side`` px, never enlarged. Intact
     images of a killed run stay.
-
-    Args:
-        capture: the chosen frames.
-        folder: the folder of the working images.
-        long_side: largest long side, px.
-        reporter: shows progress and remarks.
 
     Raises:
         InputError: an unreadable image, an image without the proportions of its camera, or a panorama.
@@ -68,30 +62,34 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     make_folder(images)
     make_folder(masks)
     names = [f"{index:06d}.png" for index in range(len(capture.frames))]
+    paths = [images / name for name in names]
     with reporter.task("reading frames", len(names)) as task:
-        todo = {}
-        for frame, name in zip(capture.frames, names, strict=True):
-            if resumable(images / name, reporter):
-                task.advance()
-            else:
-                todo[name] = frame
-        if capture.kind == "video":
-            pictures = _decoded(todo)
-        else:
-            pictures = ((name, read_image(frame)) for name, frame in todo.items())
-        for name, rgb in pictures:
-            write_rgb(images / name, reduced(rgb, long_side))
+        todo = {
+            path: frame
+            for path, frame in zip(paths, capture.frames, strict=True)
+            if not resumable(path, reporter)
+        }
+        task.update(done=len(names) - len(todo))
+        for path, rgb in _pictures(todo):
+            write_rgb(path, reduced(rgb, long_side))
             task.advance()
-    _refuse_panoramas(capture, [images / name for name in names])
-    still = still_parts([images / name for name in names])
+    first = list(zip(capture.frames, paths, strict=True))[:_PANORAMAS]
+    if all(
+        (frame.pts is None and is_panorama(frame.path)) or wraps_around(read_rgb(p)) for frame, p in first
+    ):
+        raise InputError(
+            "the pictures are equirectangular panoramas, which show all directions",
+            hint="cut perspective views out of them first (ffmpeg's filter v360 does), and give these",
+        )
+    still = still_parts(paths)
     if still is not None:
         reporter.warn(
             f"{(still == 0).mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
             "masked in all frames"
         )
     prepared = [
-        _work_frame(frame, images / name, masks / f"{name}.png", still, reporter)
-        for frame, name in zip(capture.frames, names, strict=True)
+        _work_frame(frame, path, masks / f"{path.name}.png", still, reporter)
+        for frame, path in zip(capture.frames, paths, strict=True)
     ]
     if any(made.masked for made in prepared):
         for made in prepared:  # COLMAP leaves out an image that has none where others have
@@ -104,18 +102,6 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             f"{transparent} of {len(prepared)} images are transparent in places: ignored, like masks"
         )
     return prepared
-
-
-def _refuse_panoramas(capture: Capture, images: Sequence[Path]) -> None:
-    """Raise InputError if the first images are equirectangular by their metadata or their edges."""
-    first = list(zip(capture.frames, images, strict=True))[:_PANORAMAS]
-    if all(
-        (frame.pts is None and is_panorama(frame.path)) or wraps_around(read_rgb(at)) for frame, at in first
-    ):
-        raise InputError(
-            "the pictures are equirectangular panoramas, which show all directions",
-            hint="cut perspective views out of them first (ffmpeg's filter v360 does), and give these",
-        )
 
 
 def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = read_rgb) -> bool:
@@ -146,12 +132,16 @@ def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, ImageU8]]:
-    """Yield the names and images of these frames of videos, one video after the other."""
-    for video in dict.fromkeys(frame.path for frame in frames.values()):
-        names = {frame.pts: name for name, frame in frames.items() if frame.path == video}
-        wanted = [pts for pts in names if pts is not None]
-        yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, wanted))
+def _pictures(frames: Mapping[Path, SourceFrame]) -> Iterator[tuple[Path, ImageU8]]:
+    """Yield the keys and pictures of ``frames``. Each video is decoded once."""
+    of_video: dict[Path, dict[int, Path]] = {}
+    for key, frame in frames.items():
+        if frame.pts is None:
+            yield key, read_image(frame)
+        else:
+            of_video.setdefault(frame.path, {})[frame.pts] = key
+    for video, keys in of_video.items():
+        yield from ((keys[pts], rgb) for pts, rgb in decode_frames(video, keys))
 
 
 def read_image(frame: SourceFrame) -> ImageU8:  # [H, W, 3]
@@ -177,8 +167,7 @@ def _alike(width: int, height: int, size: tuple[int, int]) -> bool:
 def _work_frame(
     frame: SourceFrame, image: Path, mask: Path, still: MaskU8 | None, reporter: Reporter
 ) -> WorkFrame:
-    rgb = read_rgb(image)
-    height, width = rgb.shape[:2]
+    width, height = image_size(image)
     camera = frame.camera
     if camera is not None:
         if not _alike(camera.width, camera.height, (width, height)):
@@ -197,11 +186,7 @@ def _work_frame(
 
 
 def _stencilled(
-    frame: SourceFrame,
-    stencil: MaskU8 | None,
-    still: MaskU8 | None,
-    width: int,
-    height: int,
+    frame: SourceFrame, stencil: MaskU8 | None, still: MaskU8 | None, width: int, height: int
 ) -> MaskU8:  # [height, width]
     """Return the mask of a working image: 0 where its own mask or that of still parts is 0."""
     mask = np.full((height, width), 255, np.uint8) if still is None else still

@@ -38,28 +38,15 @@ def publish(
 
     Points take their colour from train frames. Points that no train frame shows, or fewer than two frames
     after undistortion cropped them, are left out.
-
-    Args:
-        frames: the working images.
-        model: sparse model of the working images, in the normalised world.
-        placed: how the pose of each working image was found, or why there is none.
-        test: numbers of the test frames.
-        work: folder of the working images.
-        out: folder of the stage.
-        max_size: largest long side of the published images, px.
-        reporter: shows progress and remarks.
-
-    Returns:
-        The published model.
+    The published model is returned. ``model`` is that of the working images in ``work``, ``placed`` says how
+    the pose of each was found or why there is none, and ``test`` are the numbers of the test frames.
     """
     make_folder(out / "images")
     remove(out / "masks")  # without the folder, no frame has a mask
     if any(frame.masked for frame in frames):
         make_folder(out / "masks")
-    ours = {frame.image for frame in frames}
-    for file in (out / "images").iterdir():
-        if file.name not in ours:
-            remove(file)
+    for file in {*(out / "images").iterdir()} - {out / "images" / frame.image for frame in frames}:
+        remove(file)
     flat: list[Intrinsics] = []
     numbers: dict[Intrinsics, int] = {}
     images: dict[int, ModelImage] = {}
@@ -95,14 +82,12 @@ def publish(
     cameras = {number: camera for camera, number in numbers.items()}
     published = replace(model, cameras=cameras, images=images).select(kept)
     table = [
-        _frame_row(
-            index,
-            frame,
-            camera,
-            published.images.get(index + 1),
-            "test" if index in test else "train",
-            placed[frame.image],
-        )
+        {
+            "frame_id": index,
+            "split": "test" if index in test else "train",
+            "placed": placed[frame.image],
+            **_frame_row(frame, camera, published.images.get(index + 1)),
+        }
         for index, (frame, camera) in enumerate(zip(frames, flat, strict=True))
     ]
     write_table(out / "frames.parquet", pa.Table.from_pylist(table, FRAMES), FRAMES)
@@ -166,27 +151,16 @@ def _write_points(
     write_table(out / "observations.parquet", pa.table(observations, OBSERVATIONS), OBSERVATIONS)
 
 
-def _frame_row(
-    index: int, frame: WorkFrame, camera: Intrinsics, image: ModelImage | None, split: str, placed: str
-) -> dict[str, object]:
-    (fx, fy), (cx, cy) = camera.focal, camera.centre
-    row: dict[str, object] = {
-        "frame_id": index,
+def _frame_row(frame: WorkFrame, camera: Intrinsics, image: ModelImage | None) -> dict[str, object]:
+    pose = [] if image is None else [*image.pose.quaternion, *image.pose.translation.tolist()]
+    return {
         "name": frame.source.name,
         "image": f"images/{frame.image}",
         "time_s": frame.source.time_s,
         "width": camera.width,
         "height": camera.height,
-        "fx": fx,
-        "fy": fy,
-        "cx": cx,
-        "cy": cy,
+        **dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre), strict=True)),
+        **dict(zip(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), pose, strict=False)),
         "registered": image is not None,
         "n_points": 0 if image is None else len(image.point_ids),
-        "split": split,
-        "placed": placed,
     }
-    if image is not None:
-        pose = (*image.pose.quaternion, *image.pose.translation.tolist())
-        row.update(zip(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), pose, strict=True))
-    return row

@@ -7,10 +7,12 @@ itself runs in `cleargs.capture.sfm_worker`, a child process.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from cleargs.capture.adjustment import FIRST_LENS
 from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
-from cleargs.capture.matching import is_sound, remove_database
+from cleargs.capture.database import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
@@ -48,6 +50,15 @@ class Reconstruction:
     similarity: Similarity
     outcome: SfmOutcome
 
+    def cameras(self) -> list[dict[str, Any]]:
+        """Return lens, mean focal length (px) and number of frames of each camera."""
+        frames = Counter(image.camera_id for image in self.model.images.values())
+        return [
+            {"lens": camera.model, "focal_px": round(sum(camera.focal) / 2, 3), "frames": frames[key]}
+            for key, camera in self.model.cameras.items()
+            if frames[key]
+        ]
+
 
 def reconstruct(
     frames: Sequence[WorkFrame],
@@ -58,42 +69,33 @@ def reconstruct(
     threads: int,
     reporter: Reporter,
 ) -> Reconstruction:
-    """Return poses, cameras and points of the working images in ``folder``.
+    """Return poses, cameras and points of the working images in ``folder``, in which COLMAP works too.
 
-    Poses of the input are normalised in float64 before COLMAP uses them.
-
-    Args:
-        frames: the working images.
-        given: the input's sparse model. If its poses fit the images, it replaces the triangulation.
-        folder: folder of the working images and of COLMAP's files.
-        config: settings.
-        seed: seed of all random choices.
-        threads: CPU threads; the result does not depend on it.
-        reporter: shows progress and remarks.
+    Poses of the input are normalised in float64 before COLMAP uses them. The sparse model ``given`` with the
+    input replaces the triangulation if its poses fit the images.
 
     Raises:
         StageError: too few frames get a pose.
     """
-    posed = [frame for frame in frames if frame.source.pose is not None]
+    poses = {frame.image: frame.source.pose for frame in frames if frame.source.pose is not None}
+    posed = [frame for frame in frames if frame.image in poses]
+    adopted: SparseModel | None = None
     if not posed:
         model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
-        similarity = normalise([image.pose for _, image in sorted(model.images.items())])
-        return Reconstruction(_transformed(model, similarity), similarity, outcome)
+        return _normalised(model, None, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
-    poses = [frame.source.pose for frame in posed if frame.source.pose is not None]
-    similarity = normalise(poses)
-    adopted = None if given is None else _within_reach(_transformed(_adopted(given, posed), similarity))
-    if adopted is not None and adopted.dropped:
-        reporter.warn(
-            f"{adopted.dropped} points of the input's sparse model are not finite or out of reach: left out"
-        )
-    if adopted is not None and len(adopted.error):
-        missed = float(np.median(adopted.error))
+    worlds = _conventions(list(poses.values()), others=given is None)
+    world, _ = worlds[OWN]
+    if given is not None:
+        adopted = _within_reach(_adopted(given, posed).moved(world))
+        if adopted.dropped:
+            reporter.warn(
+                f"{adopted.dropped} points of the input's sparse model are left out: not finite, or too far"
+            )
+        missed = float(np.median(adopted.error)) if len(adopted.error) else 0.0
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
-            placed = _placed_by_input(frames, refined=False)
-            return Reconstruction(adopted, similarity, SfmOutcome(placed=placed, missed_px=missed))
-    worlds = _conventions(poses, similarity) if given is None else {OWN: (similarity, poses)}
+            return Reconstruction(adopted, world, SfmOutcome(placed=_placed(frames, {}), missed_px=missed))
     readings = {name: [world.pose(pose) for pose in read] for name, (world, read) in worlds.items()}
     model, outcome = _run(job_of(posed, readings, folder, config, seed, threads), reporter)
     if not len(model.point_ids):
@@ -102,39 +104,49 @@ def reconstruct(
             hint="check that poses, axes (OpenGL camera to world) and images belong together, "
             "or set ingest.poses=sfm",
         )
-    similarity = worlds[outcome.convention][0]
     if outcome.convention != OWN:
         reporter.warn(
             f"the poses do not fit the images in the convention of the input: read as {outcome.convention}"
         )
     _report_outcome(outcome, float(np.median(model.error)), config, reporter)
+    found = dict(outcome.placed) or dict.fromkeys(poses, "adjusted" if outcome.refined else "given")
+    outcome = outcome.model_copy(update={"placed": _placed(frames, found)})
     if outcome.method == "sfm":
-        again = normalise([image.pose for _, image in sorted(model.images.items())])
-        model, similarity = _transformed(model, again), similarity.then(again)
-        placed = _placed_by_input(frames, refined=True) | dict(outcome.placed)
-        return Reconstruction(model, similarity, outcome.model_copy(update={"placed": placed}))
+        return _normalised(model, worlds[outcome.convention][0], outcome)
     if adopted is not None and len(adopted.error) and not outcome.refined:
         model = adopted
-    placed = _placed_by_input(frames, outcome.refined)
-    return Reconstruction(model, similarity, outcome.model_copy(update={"placed": placed}))
+    return Reconstruction(model, worlds[outcome.convention][0], outcome)
 
 
-def _conventions(poses: Sequence[Pose], own: Similarity) -> dict[str, tuple[Similarity, Sequence[Pose]]]:
-    """Return the poses of a transforms.json by each convention that its author may have meant.
+def _normalised(model: SparseModel, world: Similarity | None, outcome: SfmOutcome) -> Reconstruction:
+    """Return ``model``, which is in ``world``, in the normalised world of its cameras."""
+    again = normalise([image.pose for _, image in sorted(model.images.items())])
+    return Reconstruction(model.moved(again), again if world is None else world.then(again), outcome)
 
-    The value is the similarity that normalises their world, and the poses in the input's.
-    """
-    meant = {
-        "matrices with OpenCV axes (y down, z forward)": [pose.with_flipped_axes() for pose in poses],
-        "matrices from the world to the camera": [pose.inverted(flip=True) for pose in poses],
-        "matrices from the world to the camera, with OpenCV axes": [
-            pose.inverted(flip=False) for pose in poses
-        ],
+
+def _placed(frames: Sequence[WorkFrame], found: Mapping[str, str]) -> dict[str, str]:
+    """Return how each frame was placed, by ``found``; frames that it does not have keep the input's pose."""
+    return {
+        frame.image: "no pose in the input" if frame.source.pose is None else found.get(frame.image, "given")
+        for frame in frames
     }
-    found: dict[str, tuple[Similarity, Sequence[Pose]]] = {OWN: (own, poses)}
-    for name, others in meant.items():
-        with suppress(InputError):  # all at one place by this one
-            found[name] = normalise(others), others
+
+
+def _conventions(poses: Sequence[Pose], *, others: bool) -> dict[str, tuple[Similarity, Sequence[Pose]]]:
+    """Return the poses by the input's convention, and with ``others`` by all that its author may have meant.
+
+    The value is the similarity that normalises their world, and the poses in that world.
+    """
+    found: dict[str, tuple[Similarity, Sequence[Pose]]] = {OWN: (normalise(poses), poses)}
+    if others:
+        inverse = "matrices from the world to the camera"
+        for name, meant in {
+            "matrices with OpenCV axes (y down, z forward)": [pose.with_flipped_axes() for pose in poses],
+            inverse: [pose.inverted(flip=True) for pose in poses],
+            f"{inverse}, with OpenCV axes": [pose.inverted(flip=False) for pose in poses],
+        }.items():
+            with suppress(InputError):  # all at one place by this one
+                found[name] = normalise(meant), meant
     return found
 
 
@@ -185,16 +197,9 @@ def job_of(
 ) -> Job:
     """Return the job of COLMAP's process for the working images in ``folder``.
 
-    Without poses, frames of one size and one lens share a camera, or each frame has its own. An input image
-    of each camera may state its focal length.
-
-    Args:
-        frames: the working images.
-        poses: convention -> poses of all frames; None: they must be found.
-        folder: folder of the working images.
-        config: settings.
-        seed: seed of all random choices.
-        threads: CPU threads.
+    ``poses`` are those of all frames by convention; None: they must be found. Then frames of one size and one
+    lens share a camera, or each frame has its own, and an input image of each camera may state its focal
+    length.
     """
     folder = folder.resolve()
     if poses is not None:
@@ -260,16 +265,6 @@ def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
         return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
     except FAULTS as error:
         raise InputError(f"{OUTCOME} cannot be read: {cause(error)}", hint="run ingest again") from error
-
-
-def _placed_by_input(frames: Sequence[WorkFrame], refined: bool) -> dict[str, str]:
-    found = "adjusted" if refined else "given"
-    return {frame.image: "no pose in the input" if frame.source.pose is None else found for frame in frames}
-
-
-def _transformed(model: SparseModel, similarity: Similarity) -> SparseModel:
-    images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in model.images.items()}
-    return replace(model, images=images, xyz=similarity.points(model.xyz))
 
 
 def _within_reach(model: SparseModel) -> SparseModel:

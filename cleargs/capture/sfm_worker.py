@@ -15,32 +15,27 @@ import copy
 import filecmp
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations, count
 from pathlib import Path
 
 import numpy as np
 
-from cleargs.capture.adjustment import (
-    FIRST_LENS,
-    SHARED_BY,
-    Adjuster,
-    lay_over,
-    lens_of,
-    median_residual,
-)
+from cleargs.capture.adjustment import FIRST_LENS, SHARED_BY, Adjuster, lay_over, lens_of, median_residual
 from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.judging import epipolar_errors, verified_matches
-from cleargs.capture.matching import (
+from cleargs.capture.database import (
+    colmap_cameras,
     copy_without_features,
-    loop_pairs,
-    match_pairs,
-    remove_database,
-    sequential_pairs,
+    create_database,
+    frames_with_few_features,
+    remove_features,
+    set_cameras,
     why_missing,
 )
+from cleargs.capture.judging import epipolar_errors, verified_matches
+from cleargs.capture.matching import loop_pairs, match_pairs, sequential_pairs
 from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
@@ -49,18 +44,17 @@ from cleargs.safe_io import read_json
 _MIN_MODEL = 10
 """COLMAP's fewest frames of a model: it discards a smaller one and starts elsewhere. In a
 short capture it is a third of the frames, because eight of twelve are a model."""
-_CONVINCING = 0.6
-"""Adjusted poses and cameras are taken if matches that were kept out are then off by at
-most this share of the error before (medians). Measured: 0.17 with the poses of a depth camera, 0.47 with
-those of a headset."""
-_EXPLAINED = 1.5
-"""Poses are found again if matches that were kept out are off by more than this, in units of the error that
-separate geometries of the pairs leave. Measured: 0.94 and 1.06 with the adjusted poses of a depth camera and
-of a headset, 3 if an adjustment from poses that were off by 4 degrees ended at wrong ones."""
+_CONVINCING, _UNEXPLAINED, _EXPLAINED = 0.3, 0.05, 1.3
+"""Other poses and cameras are taken if matches that were kept out are then off by at most the first share of
+the error before (medians), or the second if they are still off by more than `_EXPLAINED` times the error that
+separate geometries of the pairs leave: poses that bend to explain blur or a rolling shutter are farther from
+the truth than given ones, unless these are far off. All three, and the next, by docs/experiments/poses.md."""
+_NEARER = 0.9
+"""SfM is preferred to adjusted poses only if it lowers the mean error to at most this share: where both are
+right, they are alike, and adjusted poses are in the user's world exactly."""
 _FITS_PX, _FITS = 2.0, 0.5
-"""Poses fit the images where at least this share of the matches is within this
-many pixels of its epipolar line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes,
-0.13 with inverted matrices."""
+"""Poses fit the images where at least this share of the matches is within this many pixels of its epipolar
+line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes, 0.13 with inverted ones."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +68,27 @@ class _FeatureSettings:
     contrast: float = 0.02 / 3
     inliers: int = 30
     """Fewest points of the model that must fit the pose of a frame."""
+    neighbours: bool = False
+    """Placed frames within ``overlap`` of a frame that is left out get new features too: without them a
+    dark or turning stretch breaks the chain."""
     suffix: str = ""
     """Added to the name of a step that is repeated."""
 
 
 _FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
-_SECOND = _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15, suffix=" again")
+_FEW, _FAINT = 0.25, 0.002
+"""Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
+plain frames, through which a chain of frames loses its scale (docs/experiments/poses.md)."""
+_AGAIN = (
+    _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15, suffix=" again"),
+    _FeatureSettings(
+        "sfm with fainter features", neighbours=True, contrast=0.001, inliers=15, suffix=" again"
+    ),
+)
 """For frames that are left out. A blur of 24 px at 480 is half as long at half the size, and the contrast
 that it leaves is enough (docs/experiments/poses.md). Affine-shape features and guided matching of these
-frames place no more of them (blurball, office)."""
+frames place no more of them."""
 
 
 def main() -> int:
@@ -119,7 +124,7 @@ class _Sfm:
         """Make the model and its `SfmOutcome`. Raises StageError when the frames give none."""
         job = self._job
         pycolmap.set_random_seed(job.seed)
-        self._import()
+        create_database(self._database, job)
         self._extract(self._database, job.names, _FIRST)
         with pycolmap.Database.open(self._database) as opened:
             if opened.num_keypoints() == 0:
@@ -136,23 +141,19 @@ class _Sfm:
         pairs = self._pairs()
         self._match(self._database, pairs, _FIRST)
         make_folder(self._output, empty=True)
-        if job.poses is None:
-            model, placed = self._found(pairs)
-            if job.config.camera_model == "auto":
-                model = self._adjuster(self._matched).with_measured_lens(model)
-            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model))
-        else:
+        if job.poses is not None:
             model, outcome = self._from_poses(job.poses, pairs)
+        else:
+            model, placed = self._place_the_rest(self._map(), pairs)
+            if job.config.camera_model == "auto":
+                model = Adjuster(self._matched, self._with_points).with_measured_lens(model)
+            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model))
         make_folder(self._output, empty=True)
         model.write_binary(self._output)
         write_json(self._output / OUTCOME, outcome.model_dump())
         sync_tree(self._output)
         self._output.rename(job.folder / "model")
         sync(job.folder)
-
-    def _found(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Return the model of structure from motion, and how each frame was placed."""
-        return self._place_the_rest(self._map(), pairs)
 
     def _from_poses(
         self, given: Mapping[str, list[list[list[float]]]], pairs: Sequence[tuple[int, int]]
@@ -164,37 +165,34 @@ class _Sfm:
         outcome = SfmOutcome(missed_px=missed, convention=convention)
         if missed <= self._job.config.refine_above and len(start.points3D):
             return start, outcome
-        adjuster = self._adjuster(self._database)
-        errors = {"given": adjuster.median_error(start)}
-        models = {}
-        placed: dict[str, str] = {}
+        adjuster = Adjuster(self._database, self._with_points)
+        models = {"given": start}
         self._report(phase="adjusting poses and cameras", total=None)
         shared = len(self._job.names) >= SHARED_BY * len(self._job.cameras)
         adjusted = adjuster.refine(start, cameras=shared) if len(start.points3D) else None
         if adjusted is not None:
             models["adjusted"] = adjusted
-            errors["adjusted"] = adjuster.median_error(adjusted)
-        explained = adjusted is not None and errors["adjusted"] <= _EXPLAINED * adjuster.floor
-        if not explained and (found := self._sfm_over(start, pairs, adjuster)) is not None:
-            models["sfm"], placed = found
-            errors["sfm"] = adjuster.median_error(models["sfm"])
-        outcome = outcome.model_copy(update={"errors_px": errors})
-        best = min(models, key=lambda method: errors[method], default="")
-        if not best or not 0 < errors[best] <= _CONVINCING * errors["given"]:
-            return start, outcome
+        found, placed = self._sfm_over(start, pairs, adjuster)
+        if found is not None:
+            models["sfm"] = found
+        errors = {method: adjuster.median_error(model) for method, model in models.items()}
+        best = "given" if adjusted is None else "adjusted"
+        limit = np.inf if adjusted is None else _NEARER * adjuster.mean_error(adjusted)
+        if found is not None and adjuster.mean_error(found) <= limit:
+            best = "sfm"
+        share = _CONVINCING if errors[best] <= _EXPLAINED * adjuster.floor else _UNEXPLAINED
+        if not 0 < errors[best] <= share * errors["given"]:
+            return start, outcome.model_copy(update={"errors_px": errors})
         model = self._with_points(models[best], self._matched if best == "sfm" else self._database)
         update = {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
-        return model, outcome.model_copy(update=update)
-
-    def _adjuster(self, database: Path) -> Adjuster:
-        return Adjuster(database, self._with_points)
+        return model, outcome.model_copy(update={"errors_px": errors, **update})
 
     def _convention(self, given: Mapping[str, list[list[list[float]]]]) -> str:
         """Return the convention by which poses fit the matches best; `OWN` where it fits, or none does."""
         if len(given) == 1:
             return OWN
         matches = verified_matches(self._database)
-        cameras = [_colmap_camera(self._job, number) for number in range(len(self._job.cameras))]
+        cameras = colmap_cameras(self._job)
         camera_of = {index + 1: cameras[number] for index, number in enumerate(self._job.camera_of)}
         fits = {}
         for convention, matrices in given.items():
@@ -206,7 +204,7 @@ class _Sfm:
 
     def _sfm_over(
         self, given: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]], judge: Adjuster
-    ) -> tuple[pycolmap.Reconstruction, dict[str, str]] | None:
+    ) -> tuple[pycolmap.Reconstruction | None, dict[str, str]]:
         """Return the model of structure from motion in the world of ``given``, and how frames were placed.
 
         The matches that ``judge`` kept out take no part in its last adjustment. None where a frame has no
@@ -214,52 +212,28 @@ class _Sfm:
         """
         job = self._job
         guesses = [guessed_camera(FIRST_LENS, camera.width, camera.height) for camera in job.cameras]
-        self._set_cameras([pycolmap.Camera(**asdict(guess)) for guess in guesses])
+        unknown = job.model_copy(update={"cameras": guesses})
+        set_cameras(self._database, colmap_cameras(unknown))
         try:
-            model, placed = self._found(pairs)
+            model, placed = self._place_the_rest(self._map(), pairs)
         except StageError:
-            return None
+            return None, {}
         if model.num_reg_images() < len(job.names):
-            return None
+            return None, {}
         # Frames that were placed again have other features. The tracks of the others are kept out alike.
-        adjuster = judge if self._matched == self._database else self._adjuster(self._matched)
+        same = self._matched == self._database
+        adjuster = judge if same else Adjuster(self._matched, self._with_points)
         model = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
         lay_over(model, given, model.images.values())
         return model, placed
 
-    def _import(self) -> None:
-        """Create the database with cameras and images in frame order: ids do not depend on threads."""
-        job = self._job
-        cameras = [_colmap_camera(job, number) for number in range(len(job.cameras))]
-        if self._database.exists():
-            with pycolmap.Database.open(self._database) as opened:
-                whole = opened.num_images() == len(job.names)
-            if whole:
-                return self._set_cameras(cameras)  # a killed run may have adjusted them
-            remove_database(self._database)
-        with pycolmap.Database.open(self._database) as opened, pycolmap.DatabaseTransaction(opened):
-            for index, camera in enumerate(cameras):
-                camera.camera_id = index + 1
-                opened.write_camera(camera, use_camera_id=True)
-                rig = pycolmap.Rig(rig_id=index + 1)
-                rig.add_ref_sensor(camera.sensor_id)
-                opened.write_rig(rig, use_rig_id=True)
-            for index, (name, number) in enumerate(zip(job.names, job.camera_of, strict=True)):
-                shot = pycolmap.Image(name=name, camera_id=number + 1, image_id=index + 1)
-                opened.write_image(shot, use_image_id=True)
-                frame = pycolmap.Frame(frame_id=index + 1, rig_id=number + 1)
-                frame.add_data_id(shot.data_id)
-                opened.write_frame(frame, use_frame_id=True)
-
-    def _set_cameras(self, cameras: Sequence[pycolmap.Camera]) -> None:
-        with pycolmap.Database.open(self._database) as opened:
-            for index, camera in enumerate(cameras):
-                camera.camera_id = index + 1
-                opened.update_camera(camera)
-
     def _extract(self, database: Path, names: Sequence[str], settings: _FeatureSettings) -> None:
-        """SIFT on the working images; frames that have features already are skipped by COLMAP."""
+        """SIFT on the working images; frames that have features already are skipped by COLMAP.
+
+        Those for which ``settings`` find few features get fainter ones too, unless a killed run matched them.
+        """
         job = self._job
+        limit = _FEW * job.config.max_features if settings.contrast > _FAINT else 0
         options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         largest = max(max(camera.width, camera.height) for camera in job.cameras)
         options.max_image_size = largest // settings.reduced
@@ -275,20 +249,21 @@ class _Sfm:
             pycolmap.extract_features(
                 database, job.images, image_names=block, reader_options=reader, extraction_options=options
             )
+            few = frames_with_few_features(database, block, limit)
+            if few:
+                remove_features(database, few.values())
+                faint = copy.deepcopy(options)
+                faint.sift.peak_threshold = _FAINT
+                pycolmap.extract_features(
+                    database, job.images, image_names=[*few], reader_options=reader, extraction_options=faint
+                )
             self._report(done=start + len(block))
 
     def _match(self, database: Path, pairs: Sequence[tuple[int, int]], settings: _FeatureSettings) -> None:
         """Match and verify pairs of frames; pairs that were matched before are skipped."""
         job = self._job
         self._report(phase=f"matching{settings.suffix}", total=len(pairs))
-        match_pairs(
-            database,
-            job.names,
-            pairs,
-            job.seed,
-            job.threads,
-            lambda through: self._report(done=through),
-        )
+        match_pairs(database, job.names, pairs, job.seed, job.threads, lambda n: self._report(done=n))
 
     def _pairs(self) -> list[tuple[int, int]]:
         """All pairs of frames, or neighbours and distant frames that look alike."""
@@ -333,39 +308,56 @@ class _Sfm:
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
     ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Continue mapping with features by `_SECOND` of the frames without a pose.
+        """Continue mapping with other features, by `_AGAIN`, while frames have no pose.
 
-        It works in a copy of the database, so that a killed run finds the first one unchanged.
+        It works in copies of the database, so that a killed run finds the first one unchanged.
 
         Returns:
             The model, and for each image how it was placed or why it was not.
         """
-        names = self._job.names
+        names, reach = self._job.names, self._job.config.overlap
         self._matched = self._database
-        first = _names_in(model)
-        missing = [index for index, name in enumerate(names) if name not in first]
-        if not missing:
-            return model, dict.fromkeys(names, _FIRST.name)
-        second = self._database.with_name("second.db")
-        copy_without_features(self._database, second, [index + 1 for index in missing])
-        self._extract(second, [names[index] for index in missing], _SECOND)
-        self._match(second, [pair for pair in pairs if not set(missing).isdisjoint(pair)], _SECOND)
-        self._report(phase="placing frames again", total=None)
+        placed = dict.fromkeys(_names_in(model), _FIRST.name)
+        reasons: dict[str, str] = {}
+        for settings in _AGAIN:
+            missing = [index for index, name in enumerate(names) if name not in placed]
+            if not missing:
+                break
+            again = set(missing)
+            if settings.neighbours:
+                again = {i for i in range(len(names)) if any(abs(i - j) <= reach for j in missing)}
+            database = self._database.with_name(f"{settings.name.replace(' ', '-')}.db")
+            copy_without_features(self._matched, database, [index + 1 for index in again])
+            self._extract(database, [names[index] for index in sorted(again)], settings)
+            self._match(database, [pair for pair in pairs if not again.isdisjoint(pair)], settings)
+            self._report(phase="placing frames again", total=None)
+            found = self._continued(model, database, again, settings)
+            if _names_in(found) > placed.keys():
+                model, self._matched = found, database
+                placed = dict.fromkeys(_names_in(model), settings.name) | placed
+            reasons = why_missing(
+                database, {i + 1: name for i, name in enumerate(names) if name not in placed}
+            )
+        return model, placed | reasons
+
+    def _continued(
+        self, model: pycolmap.Reconstruction, database: Path, again: set[int], settings: _FeatureSettings
+    ) -> pycolmap.Reconstruction:
+        """Return the result of mapping from ``model`` on, where the frames ``again`` have new features."""
         options = copy.deepcopy(self._options)
         options.multiple_models = False
-        options.mapper.abs_pose_min_num_inliers = _SECOND.inliers
-        start = self._output / "first"
+        options.mapper.abs_pose_min_num_inliers = settings.inliers
+        kept = copy.deepcopy(model)
+        for image in model.images.values():
+            if image.image_id - 1 in again:
+                kept.deregister_frame(image.frame_id)
+        start = self._output / "start"
         make_folder(start, empty=True)
-        model.write_binary(start)
+        kept.write_binary(start)
         models = pycolmap.incremental_mapping(
-            second, self._job.images, self._output, options, input_path=start
+            database, self._job.images, self._output, options, input_path=start
         )
-        best = max([model, *models.values()], key=lambda model: model.num_reg_images())
-        if best is not model:
-            model, self._matched = best, second
-        placed = dict.fromkeys(_names_in(model), _SECOND.name) | dict.fromkeys(first, _FIRST.name)
-        reasons = why_missing(second, [index + 1 for index, name in enumerate(names) if name not in placed])
-        return model, placed | {names[image_id - 1]: reason for image_id, reason in reasons.items()}
+        return max([model, *models.values()], key=lambda model: model.num_reg_images())
 
     def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
         """Return points at the given poses and cameras, which stay as they are here."""
@@ -383,36 +375,10 @@ class _Sfm:
 
     def _with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
         """Return ``model`` with points triangulated again from the matches in ``database``."""
-        with pycolmap.Database.open(database) as opened:
-            for camera in model.cameras.values():  # COLMAP refuses a model of another lens
-                opened.update_camera(camera)
+        set_cameras(database, list(model.cameras.values()))  # COLMAP refuses a model of another lens
         return pycolmap.triangulate_points(
             model, database, self._job.images, self._output, options=self._options
         )
-
-
-def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
-    """Start from the focal length that an input image of the camera states, where it does."""
-    try:
-        stated = pycolmap.infer_camera_from_image(image)
-    except ValueError:  # a format that COLMAP does not read (it gets PNG copies): no EXIF either
-        return
-    if not stated.has_prior_focal_length:
-        return
-    factor = stated.mean_focal_length() / max(stated.width, stated.height)
-    params = list(camera.params)
-    for index in camera.focal_length_idxs():
-        params[index] = factor * max(camera.width, camera.height)
-    camera.params = params
-    camera.has_prior_focal_length = True
-
-
-def _colmap_camera(job: Job, number: int) -> pycolmap.Camera:
-    """Return camera ``number`` of the job, from the focal length that its input image states."""
-    camera = pycolmap.Camera(**asdict(job.cameras[number]))
-    if (image := job.exif_images[number]) is not None:
-        apply_exif_focal(camera, image)
-    return camera
 
 
 def _names_in(model: pycolmap.Reconstruction) -> set[str]:

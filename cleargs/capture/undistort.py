@@ -58,9 +58,8 @@ class Undistorter:
 def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
     """Prepare the undistortion of a camera's images to a long side of at most ``max_size`` px.
 
-    The pinhole keeps the lens's focal lengths, so that the centre of the image keeps its scale. It shows the
-    largest rectangle around the axis that the lens's image covers wholly, as COLMAP's undistorter does
-    without blank pixels.
+    The pinhole keeps the lens's focal lengths. It shows the largest rectangle around the axis that the lens's
+    image covers wholly, as COLMAP's undistorter does without blank pixels.
 
     Raises:
         InputError: the distortion leaves no such rectangle.
@@ -97,11 +96,8 @@ def _covered(lens: Intrinsics) -> tuple[float, float, float, float]:
         finite = np.isfinite(rays).all(axis=1)
         return np.asarray(rays[finite], np.float64)
 
-    left, right = edge(zero, t)[:, 0], edge(one, t)[:, 0]
-    top, bottom = edge(t, zero)[:, 1], edge(t, one)[:, 1]
-    return (
-        float(left.max(initial=-MAX_TANGENT)),
-        float(top.max(initial=-MAX_TANGENT)),
-        float(right.min(initial=MAX_TANGENT)),
-        float(bottom.min(initial=MAX_TANGENT)),
-    )
+    first = (edge(zero, t)[:, 0], edge(t, zero)[:, 1])
+    last = (edge(one, t)[:, 0], edge(t, one)[:, 1])
+    left, top = (float(tangents.max(initial=-MAX_TANGENT)) for tangents in first)
+    right, bottom = (float(tangents.min(initial=MAX_TANGENT)) for tangents in last)
+    return left, top, right, bottom

@@ -12,13 +12,17 @@ import click
 from cleargs.batch.loop import Batch, Result, write_summary
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.common import (
+    fail_below_option,
     json_option,
     output_option,
     partial_option,
     print_json,
     quality_option,
     quiet_option,
+    report_below,
     report_option,
+    until_option,
+    with_shortcuts,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -45,12 +49,13 @@ To run scenes in parallel on a cluster, see docs/cluster.md.
     metavar="BATCH",
     required=False,
 )
-@click.option("--until", metavar="STAGE", help="The last stage to run.")
+@until_option
 @quality_option
 @click.option(
     "--dry-run", is_flag=True, help="Only check the sheet; show which stages would run, and the cost."
 )
 @click.option("--summary", is_flag=True, help="Run nothing; write summary and page of the present results.")
+@fail_below_option("psnr_unseen, frames_placed ...")
 @report_option("Write a report of each scene, and BATCH/report/index.html with links to them.")
 @partial_option
 @work_options
@@ -62,9 +67,10 @@ def batch(
     sheet: Path,
     folder: Path | None,
     until: str | None,
-    quality: tuple[str, ...],
+    quality: str | None,
     dry_run: bool,
     summary: bool,
+    fail_below: dict[str, float],
     wants_report: bool,
     allow_partial: bool,
     device: DeviceChoice,
@@ -89,9 +95,10 @@ def batch(
     if not (looks_only and device == "cuda"):
         resolved = resolve_device(device, reporter.info, test=not looks_only)
     falls_back = device == "auto" and resolved == "cuda"
+    settings = with_shortcuts((), {"quality": quality})
     root = (folder or sheet.with_suffix(".batch")).absolute()
     try:
-        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, quality, options, falls_back)
+        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, settings, options, falls_back)
         scenes.check(sheet)
     except SheetError as error:
         for problem in error.problems:
@@ -124,7 +131,10 @@ def batch(
         click.echo("\n".join(_line(result) for result in results))
         click.echo(", ".join(f"{count} {state}" for state, count in states.items()))
         click.echo(f"summary: {root / 'summary.csv'}" + (f"\nreport: {page}" if page else ""))
-    return 1 if states["failed"] or states["waiting"] else 3 if states["partial"] else 0
+    numbers = ("frames", "frames_placed", "psnr_unseen", "minutes", "memory_gb", "disk_gb")
+    figures = {result.scene: {name: getattr(result, name) for name in numbers} for result in results}
+    below = report_below(figures, fail_below)
+    return 1 if below or states["failed"] or states["waiting"] else 3 if states["partial"] else 0
 
 
 def _line(result: Result) -> str:

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import click
 
+from cleargs.cli.progress_bars import LOG, VERBOSE, LineFile
+from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest
+from cleargs.pipeline.config import recipe_names
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.session import usable_cores
+from cleargs.pipeline.settings import settings_of
+from cleargs.progress import Say
 from cleargs.splat.config import Quality
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -22,6 +30,17 @@ DONE_IN_PART = 3
 FOLDER = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 
+SHORTCUTS = {
+    "quality": "g0.quality",
+    "steps": "g0.steps",
+    "max_frames": "ingest.max_frames",
+    "size": "ingest.max_size",
+    "holdout": "ingest.holdout",
+    "start": "ingest.start",
+    "end": "ingest.end",
+}
+"""Option -> the setting that it stands for."""
+
 store_option = click.option(
     "--store",
     envvar="CLEARGS_STORE",
@@ -30,15 +49,129 @@ store_option = click.option(
     help="Folder of the results, which several runs may share.  [default: RUN/.store]",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and results only.")
+
+
+def quiet_option(command: F) -> F:
+    """Add the options ``-q``, ``--log`` and ``--progress``. The command receives ``quiet``."""
+
+    def keep(context: click.Context, parameter: click.Parameter, value: Any) -> None:
+        if parameter.name == "log":
+            value = None if value is None else LineFile(value)
+        context.meta[f"cleargs.{parameter.name}"] = value
+
+    for option in (
+        click.option(
+            "--progress",
+            type=click.Choice(["auto", "lines", "json"]),
+            default="auto",
+            expose_value=False,
+            callback=keep,
+            help="Progress on stderr: bars on a terminal and lines elsewhere (auto), lines, or one JSON "
+            "object per event.  [default: auto]",
+        ),
+        click.option(
+            "--log",
+            type=FILE,
+            expose_value=False,
+            callback=keep,
+            help="Also write messages to this file.",
+        ),
+        click.option("-q", "--quiet", is_flag=True, help="Print warnings and results only."),
+    ):
+        command = option(command)
+    return command
+
+
 partial_option = click.option(
     "--allow-partial", is_flag=True, help="Continue after a stage that is done only in part."
 )
 run_argument = click.argument("run", type=FOLDER)
-scene_option = click.option(
-    "--stage", "chosen", help="Stage whose scene to use.  [default: the last finished one]"
+
+
+verbose_option = click.option(
+    "-v",
+    "--verbose",
+    is_flag=True,
+    expose_value=False,
+    callback=lambda context, parameter, value: context.meta.update({VERBOSE: value}),
+    help="Also print device, store, and cost of each stage.",
 )
 
+
+@contextmanager
+def kept_log(context: click.Context, path: Path, *, writes: bool) -> Iterator[Say]:
+    """Write the messages of a command to ``path`` too, if it ``writes``, and the error that ends it.
+
+    Yields a function for details, which are shown only with ``-v``.
+    """
+    chosen: Say | None = context.meta.get(LOG)
+    file = LineFile(path, beside=RUN_FILE)  # nothing is written into a folder that is not a run
+
+    def log(text: str) -> None:
+        if chosen is not None:
+            chosen(text)
+        if writes:
+            with suppress(StoreError):  # the run itself does not need its log
+                file(text)
+
+    def detail(text: str) -> None:
+        log(text)
+        if context.meta.get(VERBOSE):
+            click.echo(text, err=True)
+
+    context.meta[LOG] = log
+    try:
+        yield detail
+    except BaseException as error:
+        from cleargs.cli.main import explanation
+
+        cause = explanation(error)[1] if isinstance(error, Exception) else "interrupted"
+        log(f"error: {cause}")
+        raise
+
+
+def completed(names: Callable[[], Iterable[str]]) -> Callable[..., list[str]]:
+    """Return the function by which click completes a value: those of ``names`` that begin with it."""
+    return lambda context, parameter, begin: [name for name in names() if name.startswith(begin)]
+
+
+def stage_names() -> tuple[str, ...]:
+    """Return the names of the installed stages."""
+    return installed().names
+
+
+def setting_names() -> list[str]:
+    """Return all settings, each with the ``=`` that follows in ``--set``."""
+    dag = installed()
+    return [f"{one.name}=" for name in dag.names for one in settings_of(name, dag.load(name).CONFIG)]
+
+
+scene_option = click.option(
+    "--stage",
+    "chosen",
+    shell_complete=completed(stage_names),
+    help="Stage whose scene to use.  [default: the last finished one]",
+)
+until_option = click.option(
+    "--until", metavar="STAGE", shell_complete=completed(stage_names), help="The last stage to run."
+)
+recipe_option = click.option(
+    "--recipe",
+    "--workflow",
+    "recipe",
+    metavar="NAME|FILE.toml",
+    shell_complete=completed(recipe_names),
+    help="default, smoke, paper, paper-open, or your TOML file.  [default: default; an existing run keeps "
+    "its settings]",
+)
+set_option = click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="STAGE.FIELD=VALUE",
+    shell_complete=completed(setting_names),
+    help="Change one setting. `cleargs settings` lists them.",
+)
 
 threads_option = click.option(
     "--threads",
@@ -53,12 +186,6 @@ def output_option(
 ) -> Callable[[F], F]:
     """Return the option ``-o`` of a command that fills a folder."""
     return click.option("-o", "--output", name, metavar=metavar, required=required, type=FOLDER, help=help)
-
-
-def file_option(help: str) -> Callable[[F], F]:
-    """Return the option ``-o`` of a command that writes a file; ``help`` lists the endings of the formats."""
-    help = f"The new file. Its ending chooses the format: {help}"
-    return click.option("-o", "--output", required=True, type=FILE, help=help)
 
 
 def report_option(help: str) -> Callable[[F], F]:
@@ -83,7 +210,6 @@ def parse_size(
 quality_option = click.option(
     "--quality",
     type=click.Choice(get_args(Quality)),
-    callback=lambda context, parameter, value: () if value is None else (f"g0.quality={value}",),
     help="The cost of a run: draft is a look at no more than 60 frames of 640 px, without repairs; standard "
     "is for publishing; high takes four times its steps and twice its Gaussians. Steps and budgets that a "
     "recipe names stay.  [default: standard]",
@@ -127,3 +253,59 @@ def answer(as_json: bool, facts: Any, *lines: str) -> None:
     else:
         for line in lines:
             click.echo(line)
+
+
+def _limits(context: click.Context, parameter: click.Parameter, value: tuple[str, ...]) -> dict[str, float]:
+    found = {}
+    for text in value:
+        name, _, number = text.partition("=")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            raise click.BadParameter(f"{text!r} does not have the form FIGURE=VALUE") from None
+    return found
+
+
+def fail_below_option(figures: str) -> Callable[[F], F]:
+    """Return the option ``--fail-below``, whose value is figure -> limit; ``figures`` lists them."""
+    return click.option(
+        "--fail-below",
+        multiple=True,
+        metavar="FIGURE=VALUE",
+        callback=_limits,
+        help=f"End with exit code 1 if this figure of a result is below VALUE, or missing: {figures}.",
+    )
+
+
+def report_below(results: Mapping[str, Mapping[str, Any]], limits: Mapping[str, float]) -> bool:
+    """Print a line on stderr for each figure of ``results`` that is below its limit. Return True if one is.
+
+    Raises:
+        InputError: No result has a figure of this name.
+    """
+    failed = False
+    for figure, limit in limits.items():
+        if results and not any(figure in figures for figures in results.values()):
+            known = ", ".join(sorted({name for figures in results.values() for name in figures}))
+            raise InputError(f"there is no figure {figure!r}", hint=f"choose one of {known}")
+        for name, figures in results.items():
+            value = figures.get(figure)
+            if value is None or value < limit:
+                failed = True
+                click.echo(f"below the limit: {name}: {figure} {value} < {limit:g}", err=True)
+    return failed
+
+
+def with_shortcuts(overrides: Sequence[str], values: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the settings of the options in ``values`` (`SHORTCUTS`; None: not given), then ``overrides``.
+
+    Raises:
+        InputError: ``overrides`` has one of these settings too.
+    """
+    named = {text.partition("=")[0].strip() for text in overrides}
+    given = {SHORTCUTS[option]: (option, value) for option, value in values.items() if value is not None}
+    for setting, (option, _) in given.items():
+        if setting in named:
+            flag = f"--{option.replace('_', '-')}"
+            raise InputError(f"{flag} and --set {setting} are the same setting", hint="give one of them")
+    return (*(f"{setting}={value}" for setting, (_, value) in given.items()), *overrides)

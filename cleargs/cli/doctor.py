@@ -15,6 +15,7 @@ import click
 import cleargs
 from cleargs import gpu
 from cleargs.cli.common import answer, json_option
+from cleargs.cli.user_config import user_config_file
 from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import usable_cores
 from cleargs.splat.kernels.memory import available_memory
@@ -52,7 +53,7 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
 
     FOLDER is the folder for runs. The exit code is 1 if a run would fail on this machine.
     """
-    pace = cached_pace()
+    pace, config = cached_pace(), user_config_file()
     device, report = _device(wants_test)
     speed = "not measured yet" if pace is None else f"takes {pace:.2f} of the reference machine's time"
     findings = [
@@ -74,6 +75,7 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
             "cleargs gc frees what no run needs",
         ),
         device,
+        Finding("configuration", "ok", f"{'' if config.is_file() else 'no '}{config}"),
         Finding("pace", "ok", speed),
         _writable("runs", folder),
         _writable("caches", Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")),

@@ -8,18 +8,20 @@ import sys
 
 
 def main() -> None:
-    """Run the command line and exit. The exit code is 2 on other systems than Linux."""
+    """Run the command line and exit. The exit code is 2 on Windows."""
     # During the import below, Python would answer Ctrl-C with a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    if not sys.platform.startswith("linux"):
-        print(f"error: ClearGS runs on Linux; this is {sys.platform}", file=sys.stderr)
-        print("hint: use a Linux machine or a container; on Windows, use WSL 2", file=sys.stderr)
+    if sys.platform == "win32":
+        print("error: ClearGS does not run on Windows itself", file=sys.stderr)
+        print("hint: use WSL 2 or a container", file=sys.stderr)
         sys.exit(2)
     # Waiting OpenMP threads should sleep: awake, they take a core from other programs, or even from the
     # thread for which they wait. PyTorch reads the variable when it is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    from cleargs.cli.commands import name_program
     from cleargs.cli.main import main as run
 
+    name_program()
     try:
         run()
     finally:  # the command has ended: there is nothing left to interrupt

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, threads_option
+from cleargs.cli.common import (
+    fail_below_option,
+    json_option,
+    print_json,
+    quiet_option,
+    report_below,
+    threads_option,
+)
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import file_digest
 from cleargs.errors import InputError
@@ -106,10 +114,11 @@ stages and options stay there as long as their scenes do.
     type=click.IntRange(0, 200),
     default=0,
     show_default=True,
-    help="First fit each rendered pose to its reference, in this many steps.",
+    help="Measure a second time, with each rendered pose fitted to its reference in this many steps.",
 )
 @click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
+@fail_below_option("psnr, ssim ...")
 @threads_option
 @click.option("-v", "--per-image", is_flag=True, help="Show every image in the table.")
 @json_option
@@ -129,11 +138,12 @@ def eval(
     refine_poses: int,
     save_renders: Path | None,
     output: Path | None,
+    fail_below: dict[str, float],
     threads: int,
     per_image: bool,
     as_json: bool,
     quiet: bool,
-) -> None:
+) -> int:
     """Compare a scene with sharp images: PSNR, SSIM, LPIPS and no-reference scores.
 
     Images are rendered at the reference's size without exposure compensation and compared as 8-bit sRGB.
@@ -149,7 +159,10 @@ def eval(
             "--poses given needs --reference", hint="held-out frames are rendered at their own poses anyway"
         )
     nets: tuple[LpipsNet, ...] = LPIPS_NETS if lpips == "both" else () if lpips == "none" else (lpips,)
-    options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
+    options = [
+        EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=steps)
+        for steps in dict.fromkeys((0, refine_poses))
+    ]
     from cleargs.evaluate.eval_report import Report, write_report
     from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
     from cleargs.evaluate.references import reference_of, views_trained_on
@@ -157,17 +170,18 @@ def eval(
     reporter = make_reporter(quiet)
     reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
     evaluations = []
-    for subject, scene in scenes.items():
+    for (subject, scene), chosen in product(scenes.items(), options):
         save = save_renders / subject if save_renders is not None and len(scenes) > 1 else save_renders
+        save = save / "refined" if save is not None and chosen.refine_poses else save
         found = evaluate_scene(
-            scene, reference, options=options, threads=threads, reporter=reporter, subject=subject, save=save
+            scene, reference, options=chosen, threads=threads, reporter=reporter, subject=subject, save=save
         )
         trained = None if run is None else views_trained_on(run, subject, reference)
         evaluations.append(found.model_copy(update={"trained_on": trained}))
     if renders is not None:
         evaluations.append(
             evaluate_images(
-                renders, reference, options=options, threads=threads, reporter=reporter, save=save_renders
+                renders, reference, options=options[-1], threads=threads, reporter=reporter, save=save_renders
             )
         )
     report = Report(evaluations=tuple(evaluations))
@@ -185,6 +199,7 @@ def eval(
         _print(report, per_image, output)
         for line in filter(None, map(_with_colours_aligned, report.evaluations)):
             click.echo(line)
+    return int(report_below({found.subject: found.means for found in report.evaluations}, fail_below))
 
 
 def _with_colours_aligned(evaluation: Evaluation) -> str:
@@ -193,8 +208,8 @@ def _with_colours_aligned(evaluation: Evaluation) -> str:
     if plain is None or aligned is None or aligned - plain < EXPOSURES_DIFFER:
         return ""
     return (
-        f"{evaluation.subject}: exposures differ: PSNR is {aligned:.2f} dB with the colours aligned to each "
-        f"reference (+{aligned - plain:.2f} dB); --align-colour gives all figures so"
+        f"{_subject(evaluation)}: exposures differ: PSNR is {aligned:.2f} dB with the colours aligned to "
+        f"each reference (+{aligned - plain:.2f} dB); --align-colour gives all figures so"
     )
 
 
@@ -267,7 +282,8 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
     for evaluation in report.evaluations:
         shown = [(image.name, image.values) for image in evaluation.images] if per_image else []
         for name, values in [*shown, (f"mean of {len(evaluation.images)}", evaluation.means)]:
-            table.add_row(evaluation.subject, name, *(_figure(metric, values[metric]) for metric in metrics))
+            figures = (_figure(metric, values[metric]) for metric in metrics)
+            table.add_row(_subject(evaluation), name, *figures)
     console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
     console.print(table)
     for evaluation in report.evaluations:
@@ -279,6 +295,10 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
         console.print(f"written: {output}")
 
 
+def _subject(evaluation: Evaluation) -> str:
+    return evaluation.subject + (", poses refined" if evaluation.options.refine_poses else "")
+
+
 def _provenance(evaluation: Evaluation) -> str:
     """One line on what was compared, so that a table can be judged."""
     words = [f"reference {evaluation.reference}, split {evaluation.split[:12]}"]
@@ -288,20 +308,21 @@ def _provenance(evaluation: Evaluation) -> str:
         words.append(f"worlds aligned, residual {evaluation.alignment.residual:.2%}")
     if evaluation.options.align_colour:
         words.append("colours aligned")
-    if evaluation.options.refine_poses:
-        words.append(f"poses refined in {evaluation.options.refine_poses} steps")
     return "; ".join(words)
 
 
 def _regions(evaluation: Evaluation) -> str:
     """Return a line on regions in which scenes often fail."""
     parts = {"behind the sparse points": evaluation.far, "clipped in the references": evaluation.clipped}
-    words = (
+    words = [
         f"{name} {part.share:.1%} of the pixels, {_figure('psnr', part.psnr)} dB"
         for name, part in parts.items()
         if part is not None
-    )
-    return f"{evaluation.subject}: {'; '.join(words)}"
+    ]
+    if evaluation.psnr_white is not None:
+        between = _figure("psnr", evaluation.psnr_between)
+        words.append(f"over white {evaluation.psnr_white:.2f} dB, {between} dB from black")
+    return f"{_subject(evaluation)}: {'; '.join(words)}"
 
 
 def _figure(metric: str, value: float | None) -> str:

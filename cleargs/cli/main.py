@@ -7,51 +7,35 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
+from pathlib import Path
+from shlex import quote
 
 import click
 
 import cleargs
-from cleargs.errors import CleargsError
+from cleargs.cli.commands import ALIASES, COMMANDS, SECTIONS, as_called
+from cleargs.errors import CleargsError, InputError
 from cleargs.pipeline.dag import Dag, installed
 from cleargs.safe_io import printable, require_utf8
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as in shells: 128 + SIGINT."""
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    "run": ("cleargs.cli.run", "Turn a capture into a clean scene: run all missing stages."),
-    "status": ("cleargs.cli.run", "Show which stages are done, and what changed if one is not."),
-    "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
-    "watch": ("cleargs.cli.report", "Follow a run in the browser, then see its report."),
-    "report": ("cleargs.cli.report", "Write the report of a run: the scene in 3D, and every frame."),
-    "render": ("cleargs.cli.render", "Render pictures and films of the scene."),
-    "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
-    "eval": ("cleargs.cli.eval", "Measure the quality of a scene with sharp images."),
-    "batch": ("cleargs.cli.batch", "Run all scenes of a sheet."),
-    "stage": ("cleargs.cli.run", "Run one stage of a prepared run."),
-    "settings": ("cleargs.cli.settings", "List all settings with default, range and meaning."),
-    "models": ("cleargs.cli.models", "List, install and verify model weights."),
-    "synth": ("cleargs.cli.synth", "Make a synthetic capture with known ground truth."),
-    "verify": ("cleargs.cli.store", "Check every file of a run for damage."),
-    "gc": ("cleargs.cli.store", "Remove results that no run links to."),
-    "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
-}
-"""Command -> (module with the click command of that name, where _ replaces -; line in ``cleargs --help``)."""
-
-ALIASES = {"explain": "status"}
-"""Old name of a command -> its name."""
+VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
+"""Endings of names that users may give in place of a command."""
 
 EPILOG = """\b
 Examples:
-  cleargs run video.mp4 -o room              a video, an image folder, a COLMAP project ...
-  cleargs run video.mp4 -o room --set rva.tau_R=0.7
-  cleargs show room                          results of each stage
-  cleargs status room                        which stages are done, and which setting changed
-  cleargs settings g0                        settings of a stage
-  cleargs report room                        a page for your browser: room/report/index.html
-  cleargs render room -o room.mp4            a film along the capture's path
-  cleargs export room -o room.compressed.ply
+  cleargs run walk.mp4                       the scene is walk/scene.ply, the report walk/report.html
+  cleargs run walk.mp4 --quality draft       a first look, within minutes
+  cleargs run walk.mp4 --set rva.tau_R=0.7   repeats only the stages that this setting affects
+  cleargs export walk --for blender          also unreal, unity, supersplat, web
+  cleargs completion bash >> ~/.bashrc       complete commands, stages, settings and recipes with TAB
+
+\b
+Defaults for store, device, threads and quality: ~/.config/cleargs/config.toml, as `device = "cpu"`.
 
 \b
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,
@@ -75,15 +59,35 @@ class LazyGroup(click.Group):
         assert isinstance(command, click.Command)
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if name in COMMANDS or name in ALIASES or name.startswith("-"):
+            return super().resolve_command(ctx, args)
+        path = Path(name)
+        if path.exists() or path.suffix.lower() in VIDEOS:
+            known = (
+                f"did you mean cleargs {'show' if (path / 'run.toml').is_file() else 'run'} {quote(name)}?"
+            )
+        else:
+            near = get_close_matches(name, (*COMMANDS, *ALIASES), n=1)
+            known = f"did you mean cleargs {ALIASES.get(near[0], near[0])}?" if near else "see cleargs --help"
+        raise InputError(f"there is no command {name!r}", hint=known)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+        *sections, (last, more) = SECTIONS.items()
+        for title, commands in sections:
+            with formatter.section(title):
+                formatter.write_dl([(name, line) for name, (_, line) in commands.items()])
+        with formatter.section(last):
+            formatter.write_text(", ".join(more))
 
 
 @click.group(
     "cleargs", cls=LazyGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]}
 )
-@click.version_option(cleargs.__version__, prog_name="cleargs")
+@click.version_option(cleargs.__version__, "-V", "--version", prog_name="cleargs")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 def cli(debug: bool) -> None:
     """Turn a handheld video of mixed quality into a clean 3D Gaussian Splatting scene.
@@ -119,12 +123,22 @@ def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = 
     An error is printed on stderr: a line with the cause, and one with a hint. ``--debug``, anywhere among the
     arguments, adds the traceback.
     """
+    from cleargs.cli.user_config import user_defaults
+
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     try:
         for argument in arguments:
             require_utf8(argument)
-        code = program.main(arguments, prog_name=program.name, standalone_mode=False, obj=dag or installed())
+        code = program.main(
+            arguments,
+            prog_name=program.name,
+            standalone_mode=False,
+            obj=dag or installed(),
+            default_map=user_defaults(COMMANDS),
+        )
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
         return _interrupted()
@@ -138,7 +152,7 @@ def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = 
             traceback.print_exc()
         code, cause, remedy = explanation(error)
         click.echo(f"error: {cause}", err=True)
-        click.echo(f"hint: {remedy}", err=True)
+        click.echo(as_called(f"hint: {remedy}"), err=True)
         return code
 
 

@@ -1,35 +1,120 @@
-"""Progress on stderr: bars on a terminal, plain lines elsewhere."""
+"""Progress on stderr: bars on a terminal, plain lines elsewhere, or JSON; and a log of it."""
 
 from __future__ import annotations
 
+import json
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from datetime import timedelta
-from typing import TYPE_CHECKING
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from cleargs.progress import CountedTask, LineReporter, Reporter, Task
+from cleargs.cli.commands import as_called
+from cleargs.files import disk_errors
+from cleargs.progress import CountedTask, ForwardingTask, LineReporter, Reporter, Say, Task
 from cleargs.safe_io import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+PROGRESS, LOG, VERBOSE = "cleargs.progress", "cleargs.log", "cleargs.verbose"
+"""Entries of click's ``Context.meta``: ``--progress``, a function that writes to the log, and ``-v``."""
+
+JSON_EVERY = 1.0
+"""Seconds between two progress events of one task."""
+
 
 def make_reporter(quiet: bool = False) -> Reporter:
-    """Return a reporter for stderr: bars on a terminal, lines elsewhere; only warnings if ``quiet``."""
-    if sys.stderr.isatty() and not quiet:
-        return BarReporter()
+    """Return a reporter for stderr: bars on a terminal, lines elsewhere; only warnings if ``quiet``.
+
+    ``--progress`` of the running command chooses one of these or JSON lines. The lines also go to the file of
+    ``--log``.
+    """
+    context = click.get_current_context(silent=True)
+    chosen = {} if context is None else context.meta
+    progress, log = chosen.get(PROGRESS, "auto"), chosen.get(LOG)
 
     def echo(text: str) -> None:
-        click.echo(printable(text), err=True)
+        click.echo(printable(as_called(text)), err=True)
 
     def no_echo(text: str) -> None:
         """Print nothing."""
 
     say = no_echo if quiet else echo
-    return LineReporter(say, lambda text: echo(f"warning: {text}"), say)
+    if progress == "json":
+        shown: Reporter = JsonReporter()
+    elif progress == "auto" and sys.stderr.isatty() and not quiet:
+        shown = BarReporter()
+    else:
+        shown = LineReporter(say, lambda text: echo(f"warning: {text}"), say)
+    return shown if log is None else LoggingReporter(shown, log)
+
+
+class LineFile:
+    """A text file that grows by lines with the time. Lines wait until the file ``beside`` it exists."""
+
+    def __init__(self, path: Path, beside: str = ".") -> None:
+        self.path, self._beside, self._waiting = path, path.parent / beside, [""]
+
+    def __call__(self, text: str) -> None:
+        self._waiting.append(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}")
+        if self._beside.exists():
+            with disk_errors(self.path), self.path.open("a", encoding="utf-8") as file:
+                file.writelines(f"{line}\n" for line in self._waiting)
+            self._waiting.clear()
+
+
+class LoggingReporter:
+    """Forward to a reporter, and write the lines to a function too."""
+
+    def __init__(self, shown: Reporter, log: Say) -> None:
+        self._shown, self._lines = shown, LineReporter(log, lambda text: log(f"warning: {text}"), log)
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        with self._shown.task(label, total) as first, self._lines.task(label, total) as second:
+            yield ForwardingTask(first, total, lambda done, note, left: second.update(done=done, note=note))
+
+    def info(self, text: str) -> None:
+        self._shown.info(text)
+        self._lines.info(text)
+
+    def warn(self, text: str) -> None:
+        self._shown.warn(text)
+        self._lines.warn(text)
+
+
+class JsonReporter:
+    """One JSON object per line on stderr. Its ``event`` is info, warning, begin, progress or end."""
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        last = begin = time.monotonic()
+
+        def show(done: int, note: str, left: float | None) -> None:
+            nonlocal last
+            if time.monotonic() - last >= JSON_EVERY:
+                last = time.monotonic()
+                figures = {"done": done, "total": total, "note": note, "seconds_left": left}
+                self._print("progress", task=label, **figures)
+
+        self._print("begin", task=label, total=total)
+        task = CountedTask(total, show)
+        yield task
+        self._print("end", task=label, seconds=round(time.monotonic() - begin, 3), note=task.note)
+
+    def info(self, text: str) -> None:
+        self._print("info", text=text)
+
+    def warn(self, text: str) -> None:
+        self._print("warning", text=text)
+
+    def _print(self, event: str, **facts: Any) -> None:
+        click.echo(json.dumps({"event": event, **facts}), err=True)
 
 
 class BarReporter:
@@ -70,7 +155,7 @@ class BarReporter:
             progress.stop_task(bar)
 
     def info(self, text: str) -> None:
-        self._console.print(printable(text), markup=False, highlight=False)
+        self._console.print(printable(as_called(text)), markup=False, highlight=False)
 
     def warn(self, text: str) -> None:
         self._console.print(f"warning: {printable(text)}", style="yellow", markup=False, highlight=False)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import click
 
 from cleargs.cli.common import (
+    FILE,
     answer,
-    file_option,
     json_option,
     parse_size,
     quiet_option,
@@ -18,14 +18,10 @@ from cleargs.cli.common import (
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device
 from cleargs.report.formatting import count as count_of
-from cleargs.run_results import scene_stage
-
-SECONDS = 10.0
-"""Default length of a film."""
+from cleargs.run_results import SCENE, scene_stage
 
 
 @click.command(
@@ -80,7 +76,7 @@ renders a picture for each pose.
 @click.option(
     "--seconds",
     type=click.FloatRange(min=0, min_open=True, max=36_000),
-    help=f"Length of the film.  [default: {SECONDS:g}]",
+    help="Length of the film.  [default: 10]",
 )
 @click.option(
     "--side-by-side",
@@ -94,7 +90,7 @@ renders a picture for each pose.
     show_default=True,
     help="Codec of a film: h264 plays everywhere, av1 takes less space.",
 )
-@file_option(".mp4 .png .exr")
+@click.option("-o", "--output", required=True, type=FILE, help="The new file: .mp4, .png or .exr.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @work_options
 @json_option
@@ -102,87 +98,34 @@ renders a picture for each pose.
 @click.pass_obj
 def render(
     dag: Dag,
+    /,
     run: Path,
-    frame: int | None,
-    turntable: bool,
-    poses: Path | None,
-    world: Literal["normalised", "input"] | None,
     chosen: str | None,
-    size: tuple[int, int] | None,
-    fps: float,
-    seconds: float | None,
-    side_by_side: bool,
-    codec: Literal["h264", "av1"],
     output: Path,
     force: bool,
     device: DeviceChoice,
     threads: int,
     as_json: bool,
     quiet: bool,
+    **options: Any,
 ) -> None:
     """Render the scene of RUN: a film along the camera path, a turntable, or stills.
 
     Without --frame, --turntable and --poses, a film and numbered stills follow the camera path. A single
     still is taken in the middle of it.
     """
-    film, still = output.suffix.lower() == ".mp4", frame is not None
-    for wrong, cause, remedy in (
-        (
-            still + turntable + (poses is not None) > 1,
-            "--frame, --turntable and --poses exclude each other",
-            "give one of them",
-        ),
-        (still and film, "--frame is a still, not a film", "end --output with .png or .exr, or omit --frame"),
-        (
-            world is not None and poses is None,
-            "--world needs --poses",
-            "give --poses, or omit --world",
-        ),
-        (
-            seconds is not None and (poses is not None or still),
-            "--seconds is the length of the path or the turntable",
-            "omit it; --fps sets the speed of --poses",
-        ),
-        (
-            side_by_side and (turntable or poses is not None),
-            "--side-by-side needs frames of the capture, which --turntable and --poses do not follow",
-            "omit them to follow the path, or give --frame",
-        ),
-        (
-            side_by_side and output.suffix.lower() == ".exr",
-            "--side-by-side is only for films and PNGs",
-            "end --output with .mp4 or .png",
-        ),
-    ):
-        if wrong:
-            raise InputError(cause, hint=remedy)
-    from cleargs.render.output import kind_of, require_free, write_shots
-
-    kind = kind_of(output)
-    require_free(output, force=force)
-    stage = scene_stage(dag, run, chosen)
-    from cleargs.render.shots import CaptureShots
+    from cleargs.render.shots import ShotOptions, render_run
     from cleargs.splat.backend import set_threads
-    from cleargs.splat.ply import read_ply
 
+    given = ShotOptions(**options)
+    given.check(output)
+    stage = scene_stage(dag, run, chosen)
     reporter = make_reporter(quiet)
     on = resolve_device(device, reporter.info)
     set_threads(threads)
-    capture = CaptureShots(run / dag.names[0], size, even=kind == "film", side_by_side=side_by_side)
-    count = max(2, round(fps * (seconds or SECONDS)))
-    if poses is not None:
-        shots = capture.poses(poses, world)
-    elif turntable:
-        shots = capture.turntable(count)
-    elif still or kind == "still":
-        shots = capture.still(frame)
-    else:
-        shots = capture.path(count)
-    scene = read_ply(run / stage / "scene.ply")
-    with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
-        write_shots(output, scene, shots, task, fps=fps, codec=codec, device=on)
+    shots = render_run(run / stage / SCENE, output, given, reporter, force=force, device=on)
     camera = shots[0].camera
-    width = camera.width * (2 if side_by_side else 1)
+    width = camera.width * (2 if given.side_by_side else 1)
     facts = {"file": str(output), "stage": stage, "pictures": len(shots)}
     answer(
         as_json,

@@ -8,10 +8,12 @@ from contextlib import suppress
 from ipaddress import ip_address
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 import click
 
 from cleargs.cli.common import (
+    FILE,
     answer,
     json_option,
     quiet_option,
@@ -20,7 +22,7 @@ from cleargs.cli.common import (
     threads_option,
 )
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.errors import CleargsError
+from cleargs.errors import CleargsError, InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
@@ -31,24 +33,50 @@ from cleargs.pipeline.session import opened_store
 @click.command(
     epilog="""\b
 Examples:
-  cleargs report room              writes room/report/index.html, which opens in any browser, also offline
+  cleargs report room                           room/report.html, which opens in any browser, also offline
+  cleargs report room --single-file             one file to send: room/room-report.html
+  cleargs report room --single-file -o a.html   the same under another name
 """
 )
 @run_argument
+@click.option(
+    "--single-file", is_flag=True, help="Also write the report as one HTML file, with everything inside."
+)
+@click.option("-o", "--output", type=FILE, help="File of --single-file.  [default: RUN/NAME-report.html]")
 @threads_option
 @store_option
 @json_option
 @quiet_option
 @click.pass_obj
-def report(dag: Dag, run: Path, threads: int, store: Path | None, as_json: bool, quiet: bool) -> None:
-    """Write RUN/report/index.html: the scene in 3D before and after repair, and every frame."""
+def report(
+    dag: Dag,
+    run: Path,
+    single_file: bool,
+    output: Path | None,
+    threads: int,
+    store: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Write RUN/report.html and RUN/report/: the scene in 3D, every frame, and how to improve the result."""
+    if output is not None and not single_file:
+        hint = f"cleargs report {quote(str(run))} --single-file -o FILE.html"
+        raise InputError("-o needs --single-file", hint=hint)
     from cleargs.report.page import write_report
+    from cleargs.report.single_file import write_single_file
 
     settings = read_run_file(run, dag, store=store)
     reporter = make_reporter(quiet)
     with opened_store(settings.store) as opened:
         page = write_report(Planner(dag, settings, opened, threads, reporter))
-    answer(as_json, {"report": str(page)}, f"report: {page}")
+    facts: dict[str, Any] = {"report": str(page)}
+    line = f"report: {page}"
+    if single_file:
+        target = output or run / f"{run.resolve().name}-report.html"
+        size = write_single_file(page, target)
+        facts |= {"single_file": str(target), "bytes": size}
+        line = f"written: {target} ({size / 1e6:.1f} MB)"
+    answer(as_json, facts, line)
 
 
 def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:

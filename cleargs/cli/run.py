@@ -2,112 +2,137 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
+import cleargs
+from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
     DONE_IN_PART,
     answer,
+    completed,
     json_option,
+    kept_log,
     manifest_json,
     output_option,
     partial_option,
     print_json,
     quality_option,
     quiet_option,
+    recipe_option,
     report_option,
     run_argument,
+    set_option,
+    stage_names,
     store_option,
+    until_option,
+    verbose_option,
+    with_shortcuts,
     work_options,
 )
-from cleargs.cli.progress_bars import make_reporter
+from cleargs.cli.progress_bars import LOG, make_reporter
 from cleargs.cli.report import outdated_report_note, write_run_report
+from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
-from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
-from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device, resolve_run, usable_cores
+from cleargs.pipeline.session import (
+    DeviceChoice,
+    default_folder,
+    opened_store,
+    resolve_run,
+    usable_cores,
+)
+from cleargs.pipeline.settings import flattened
 from cleargs.report.formatting import duration
+from cleargs.report.report_json import ENTRY
 from cleargs.safe_io import printable
 
 Summaries = Mapping[str, Mapping[str, Any]]
 """Stage -> figures in its manifest."""
 
-PICTURES = ("before_after.png", "candidates.png")
-"""Pictures of a stage to look at after a run; the first that exists is named."""
-
 
 @click.command(
     epilog="""\b
 Examples:
-  cleargs run video.mp4 -o room
-  cleargs run video.mp4 -o room --start 3 --end 40        a part of it, in seconds
-  cleargs run photos/ -o room --workflow smoke            a quick test
-  cleargs run photos/ -o room --quality draft             a first impression with fewer and smaller frames
-  cleargs run photos/ -o room --set ingest.max_frames=60 --set rva.tau_R=0.7
-  cleargs run photos/ -o room --dry-run                   the stages that would run, why, and the cost
-  cleargs run photos/ -o room --until rva                 stop before training
-  cleargs run photos/ -o room --reset                     go back to the settings of the recipe
+  cleargs run walk.mp4                            into the folder walk
+  cleargs run walk.mp4 --start 3 --end 40         a part of it, in seconds
+  cleargs run photos/ -o room --quality draft     a first look with fewer and smaller frames
+  cleargs run photos/ --recipe smoke              a quick test, into the folder photos-scene
+  cleargs run photos/ -o room --max-frames 60 --set rva.tau_R=0.7
+  cleargs run photos/ -o room --dry-run           the stages that would run, why, and the cost
+  cleargs run photos/ -o room --until rva         stop before training
+  cleargs run photos/ -o room --reset             go back to the settings of the recipe
+
+\b
+Files in RUN:
+  scene.ply     the scene
+  report.html   the report
+  run.log       the messages of all calls, with their times
 """
 )
 @click.argument("source", metavar="INPUT", type=click.Path(path_type=Path))
-@output_option("The run folder. An existing run is resumed.", "folder", metavar="RUN")
-@click.option(
-    "--workflow",
-    metavar="NAME|FILE.toml",
-    help="The recipe: default, smoke, paper, paper-open, or your TOML file.  [default: default; an existing "
-    "run keeps its settings]",
-)
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="STAGE.FIELD=VALUE",
-    help="Change one setting. `cleargs settings` lists them.",
+@output_option(
+    "The run folder. An existing run is resumed.  [default: next to INPUT; walk for walk.mp4, walk-scene "
+    "for a folder walk]",
+    "folder",
+    metavar="RUN",
+    required=False,
 )
 @quality_option
+@recipe_option
+@set_option
+@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Training steps of the first scene.")
+@click.option("--max-frames", type=click.IntRange(min=2), metavar="N", help="Most frames of a video to use.")
+@click.option("--size", type=click.IntRange(min=64), metavar="PX", help="Long side of the images.")
 @click.option(
-    "--start",
-    type=click.FloatRange(min=0),
-    metavar="S",
-    help="Take a video from this second on (ingest.start).",
+    "--holdout",
+    metavar="every:N|LIST",
+    help="Frames for `cleargs eval RUN`, which no training uses.",
 )
+@click.option("--start", type=click.FloatRange(min=0), metavar="S", help="Take a video from this second on.")
 @click.option(
-    "--end",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="S",
-    help="Take a video up to this second (ingest.end).",
+    "--end", type=click.FloatRange(min=0, min_open=True), metavar="S", help="Take a video up to this second."
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of all random numbers.  [default: 0]")
 @click.option("--reset", is_flag=True, help="Replace the settings of an existing run by those of the recipe.")
-@click.option("--until", metavar="STAGE", help="The last stage to run.")
-@click.option("--force", multiple=True, metavar="STAGE", help="Run this stage even if its results exist.")
-@report_option("Write RUN/report/index.html at the end, as `cleargs report` does.")
+@until_option
+@click.option(
+    "--force",
+    multiple=True,
+    metavar="STAGE",
+    shell_complete=completed(stage_names),
+    help="Run this stage even if its results exist.",
+)
+@report_option("Write RUN/report.html at the end, which opens the report.")
+@click.option("--open", "opens", is_flag=True, help="Open the report in the browser at the end.")
 @click.option("--dry-run", is_flag=True, help="Only show which stages would run, why, and the cost.")
 @partial_option
 @work_options
 @store_option
 @json_option
 @quiet_option
-@click.pass_obj
+@verbose_option
+@click.pass_context
 def run(
-    dag: Dag,
+    context: click.Context,
+    /,
     source: Path,
-    folder: Path,
-    workflow: str | None,
+    folder: Path | None,
+    recipe: str | None,
     overrides: tuple[str, ...],
-    quality: tuple[str, ...],
-    start: float | None,
-    end: float | None,
     seed: int | None,
     reset: bool,
     until: str | None,
     force: tuple[str, ...],
     wants_report: bool,
+    opens: bool,
     dry_run: bool,
     allow_partial: bool,
     device: DeviceChoice,
@@ -115,99 +140,119 @@ def run(
     store: Path | None,
     as_json: bool,
     quiet: bool,
+    **shortcuts: Any,
 ) -> int:
     """Turn INPUT into a clean scene in the folder RUN.
 
     INPUT is a video, a folder of videos or of images, a COLMAP project (images/ and sparse/0), or a folder
-    with transforms.json or poses_bounds.npy. Existing results are reused, and an interrupted run resumes. An
-    existing run keeps its settings (RUN/run.toml). Change them with --set, --workflow or --reset.
+    with transforms.json or poses_bounds.npy. An existing RUN can be given in its place. Existing results are
+    reused, and an interrupted run resumes. An existing run keeps its settings (RUN/run.toml) until an option,
+    --recipe or --reset changes them.
     """
+    dag: Dag = context.obj
     dag.until(until)
-    reporter = make_reporter(quiet)
-    settings = resolve_run(
-        dag,
-        source,
-        folder,
-        workflow=workflow,
-        overrides=(*quality, *_stretch(start, end), *overrides),
-        seed=seed,
-        reset=reset,
-        store=store,
-        device=device,
-        test_gpu=not dry_run,
-        say=reporter.info,
-    )
-    with opened_store(settings.store) as opened:
-        check_same_input(settings, dag, opened)
-        if dry_run:
-            planner = Planner(dag, settings, opened, threads, reporter)
-            print_plans(planner.plan(until, tuple(dag.check(name) for name in force)), as_json)
-            return 0
-        runner = Runner(dag, settings, opened, threads, reporter)
-        outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
-        page = write_run_report(runner.planner, outcomes) if wants_report else None
-        if not wants_report and (line := outdated_report_note(settings.folder, dag)):
-            reporter.info(line)
+    if folder is None and (source / RUN_FILE).is_file():  # the user gives the run in place of its capture
+        folder, source = source, read_run_file(source, dag).source
+    folder = folder or default_folder(source)
+    if (folder / RUN_FILE).is_file():  # the user's defaults are those of new runs
+        kept = [name for name in ("store", "device", "quality") if _is_user_default(context, name)]
+        store = None if "store" in kept else store
+        device = "auto" if "device" in kept else device
+        shortcuts["quality"] = None if "quality" in kept else shortcuts["quality"]
+    given = with_shortcuts(overrides, shortcuts)
+    with kept_log(context, folder / "run.log", writes=not dry_run) as log:
+        reporter = make_reporter(quiet)
+        settings = resolve_run(
+            dag,
+            source,
+            folder,
+            recipe=recipe,
+            overrides=given,
+            seed=seed,
+            reset=reset,
+            store=store,
+            device=device,
+            test_gpu=not dry_run,
+            say=reporter.info,
+        )
+        for line in without_effect(settings.config, given):
+            reporter.warn(line)
+        with opened_store(settings.store) as opened:
+            check_same_input(settings, dag, opened)
+            if dry_run:
+                planner = Planner(dag, settings, opened, threads, reporter)
+                print_plans(planner.plan(until, tuple(dag.check(name) for name in force)), as_json)
+                return 0
+            log(
+                f"cleargs {cleargs.__version__}, {settings.device}, {threads} threads, store {settings.store}"
+            )
+            runner = Runner(dag, settings, opened, threads, reporter)
+            outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
+            page = write_run_report(runner.planner, outcomes) if wants_report else None
+            if not wants_report and (line := outdated_report_note(settings.folder, dag)):
+                reporter.info(line)
+        for outcome in outcomes:
+            made = outcome.manifest
+            cost = f"{made.seconds:.1f} s, {made.peak_memory_gb or 0:.2f} GB memory"
+            log(f"{outcome.stage}: {outcome.how}, {cost}, key {made.key}")
+        lines = outcome_lines(outcomes, folder, page and settings.folder / ENTRY)
+        for line in lines:
+            context.meta[LOG](line)
     if as_json:
         print_json([outcome_json(outcome) for outcome in outcomes])
     else:
-        print_outcomes(outcomes, settings.folder, page)
+        print_lines(outcomes, lines)
+    if opens and page is not None:
+        click.launch(page.as_uri())
     return exit_code(outcomes)
 
 
-def _stretch(start: float | None, end: float | None) -> list[str]:
-    """Return the settings of the options ``--start`` and ``--end``."""
-    values = {"ingest.start": start, "ingest.end": end}
-    return [f"{name}={value}" for name, value in values.items() if value is not None]
+def _is_user_default(context: click.Context, name: str) -> bool:
+    return context.get_parameter_source(name) is ParameterSource.DEFAULT_MAP
 
 
-@click.command(
-    epilog="""\b
-Example:
-  cleargs run photos/ -o room --until ingest
-  cleargs stage rva room
-"""
-)
-@click.argument("name")
+def without_effect(config: Config, given: Sequence[str]) -> Iterator[str]:
+    """Yield a line for each of the ``given`` settings that this run does not use, or uses only in part."""
+    wanted, used = (
+        dict(flattened({name: model.model_dump(mode="json") for name, model in models.items()}))
+        for models in (config.sections, config.effective)
+    )
+    names = [text.partition("=")[0].strip() for text in given]
+    for name in names:
+        if name in used and used[name] != wanted[name]:
+            quality = used.get("g0.quality")
+            yield f"{name}={wanted[name]} has no effect: with quality {quality} it is {used[name]}"
+    fixed = [
+        f"{name}={value}"
+        for name, value in wanted.items()
+        if name not in names and name.rpartition(".")[2] in ("steps", "budget") and value
+    ]
+    if "g0.quality" in names and fixed:
+        yield (
+            f"{', '.join(fixed)} stay as they are, whatever the quality; "
+            "--recipe default --reset gives them up"
+        )
+
+
+_RUN = run  # the command, whose name is an argument below
+
+
+@click.command()
+@click.argument("name", shell_complete=completed(stage_names))
 @run_argument
 @click.option("--force", is_flag=True, help="Run the stage even if its results exist.")
-@click.option("--report", "wants_report", is_flag=True, help="Write RUN/report/index.html at the end.")
+@report_option("Write the report at the end.")
 @partial_option
 @work_options
 @store_option
 @json_option
 @quiet_option
-@click.pass_obj
-def stage(
-    dag: Dag,
-    name: str,
-    run: Path,
-    force: bool,
-    wants_report: bool,
-    allow_partial: bool,
-    device: DeviceChoice,
-    threads: int,
-    store: Path | None,
-    as_json: bool,
-    quiet: bool,
-) -> int:
-    """Run the stage NAME of RUN with the settings in RUN/run.toml.
-
-    All stages before it must be done.
-    """
-    dag.check(name)
-    resolved = None if device == "auto" else resolve_device(device, click.echo)
-    settings = read_run_file(run, dag, store=store, device=resolved)
-    with opened_store(settings.store) as opened:
-        runner = Runner(dag, settings, opened, threads, make_reporter(quiet))
-        outcome = runner.run_stage(name, force=force, allow_partial=allow_partial)
-        if wants_report:
-            write_run_report(runner.planner, [outcome])
-    if as_json:
-        print_json(outcome_json(outcome))
-    else:
-        print_outcomes([outcome], settings.folder)
-    return exit_code([outcome])
+@click.pass_context
+def stage(context: click.Context, /, name: str, run: Path, force: bool, **options: Any) -> int:
+    """Run the stage NAME of an existing RUN, and the stages before it that are missing."""
+    read_run_file(run, context.obj)
+    options |= {"source": run, "until": name, "force": (name,) if force else ()}
+    return int(context.invoke(_RUN, **options))
 
 
 @click.command(
@@ -238,11 +283,8 @@ def exit_code(outcomes: Sequence[StageOutcome]) -> int:
     return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
 
 
-def print_outcomes(outcomes: Sequence[StageOutcome], run: Path, report: Path | None = None) -> None:
-    """Print missing outputs on stderr, then at most five lines on stdout.
-
-    The lines name the result, its quality, the time, the ``report`` and a picture, and the next command.
-    """
+def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:
+    """Print missing outputs on stderr, then the ``lines`` of `outcome_lines` on stdout."""
     last = outcomes[-1].manifest
     for missing in (*last.inherited, *(f"{last.stage}: {line}" for line in last.missing)):
         click.echo(f"missing: {printable(missing)}", err=True)
@@ -250,23 +292,28 @@ def print_outcomes(outcomes: Sequence[StageOutcome], run: Path, report: Path | N
         click.echo(
             "hint: give the same command again to retry, or --allow-partial to go on without it", err=True
         )
+    for line in lines:
+        click.echo(line)
+
+
+def outcome_lines(outcomes: Sequence[StageOutcome], run: Path, report: Path | None = None) -> list[str]:
+    """Return at most five lines: the result, its quality, the time, the next command, and the ``report``.
+
+    The last one is an address, which most terminals open on a click.
+    """
+    last = outcomes[-1].manifest
     summaries = {outcome.stage: outcome.manifest.summary for outcome in outcomes}
-    scene = "scene.ply" in last.files
+    scene = SCENE in last.files
     partial = ", in part" if last.status == "partial" else ""
-    place = run / last.stage / ("scene.ply" if scene else "")
-    click.echo(f"{'scene' if scene else 'results'}: {place}{partial}{_extent(summaries)}")
-    if quality := _quality(summaries):
-        click.echo(f"quality: {quality}")
-    click.echo(f"time: {_times(outcomes)}")
-    pictures = [
-        run / outcome.stage / name
-        for outcome in reversed(outcomes)
-        for name in PICTURES
-        if name in outcome.manifest.files
+    place = run / (SCENE if scene else last.stage)
+    lines = [
+        f"{'scene' if scene else 'results'}: {place}{partial}{_extent(summaries)}",
+        f"quality: {_quality(summaries)}",
+        f"time: {_times(outcomes)}",
+        as_called(f"next: {_next(summaries, run, scene)}"),
+        f"report: {report.as_uri() if report else ''}",
     ]
-    if shown := [*([report] if report else []), *pictures[:1]]:
-        click.echo(f"look at: {', '.join(map(str, shown))}")
-    click.echo(f"next: {_next(summaries, run, scene)}")
+    return [line for line in lines if not line.endswith(": ")]
 
 
 def _extent(summaries: Summaries) -> str:
@@ -290,7 +337,7 @@ def _quality(summaries: Summaries) -> str:
     if not scenes:
         return ""
     last, figures = list(scenes.items())[-1]
-    first = summaries.get("g0", {}).get("psnr_unseen")  # not with `cleargs stage`
+    first = summaries.get("g0", {}).get("psnr_unseen")
     compared = f" (first scene {first:.1f})" if last != "g0" and first is not None else ""
     text = (
         f"PSNR {figures['psnr_unseen']:.1f} dB{compared} on pixels that no training saw; "
@@ -322,7 +369,7 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
         return f"cleargs show {quote(str(run))}{stage}"
     if summaries.get("ingest", {}).get("test"):
         return f"cleargs eval {quote(str(run))}"
-    return f"cleargs export {quote(str(run))} -o {quote(f'{run.name}.ply')}"
+    return f"cleargs export {quote(str(run))} -o {quote(f'{run.absolute().name}.sog')}"
 
 
 def outcome_json(outcome: StageOutcome) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,13 +9,19 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from rich.console import Console
 from rich.table import Table
 
-from cleargs.cli.common import FILE, answer, json_option, manifest_json, print_json, run_argument
+from cleargs.cli.common import (
+    FILE,
+    answer,
+    completed,
+    json_option,
+    manifest_json,
+    print_json,
+    run_argument,
+    stage_names,
+)
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.parquet import read_any_table, read_table
@@ -29,11 +34,8 @@ if TYPE_CHECKING:
     from cleargs.report.frames import FrameRow
 
 MAX_LISTED = 16  # items of a list that are printed
-MAX_COUNTED = 12  # distinct words in a column whose numbers are printed one by one
 MAX_NAME_LENGTH = 14  # characters of a frame's name in a table
-MIN_FAULT = 0.2  # smaller distances of a cue from its best value are not reported
 LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; width in px
-PLOT = "rva-plot.png"  # default file of --plot in the run folder
 HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
 
 LABELS: Mapping[str, str] = {
@@ -42,7 +44,7 @@ LABELS: Mapping[str, str] = {
     "given_poses_missed_px": "median reprojection error at the given poses, px",
     "pose_convention": "convention of the given poses",
     "kept_out_matches_off_px": "median error of matches that took no part, by origin of the poses, px",
-    "lens": "camera model that was fitted",
+    "focal_px": "focal length, px",
     "stand_in": "stand-ins for reliable frames",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
@@ -62,33 +64,6 @@ LABELS: Mapping[str, str] = {
 OVERVIEW = ("frames", "registered", "test", "points", "roles", "gaussians", "psnr_unseen", "repairs")
 """Figures in the overview of a run, which also names the ``published`` scene."""
 
-MODELS = {
-    "none": "nothing found",
-    "blur": "motion blur",
-    "skew": "rolling shutter",
-    "both": "motion blur and rolling shutter",
-    "defocus": "defocus",
-}
-"""Model of a frame's image formation -> its name."""
-
-SOURCES = {
-    "observation": "the frame as filmed",
-    "deblurred": "the deblurred frame",
-    "render": "the render",
-}
-"""Input of the expert -> its name."""
-
-SCORES = {
-    "R": "reliability",
-    "B": "risk of degradation",
-    "G": "geometric utility",
-    "C": "coverage gain",
-    "D": "pose diversity",
-    "O": "redundancy",
-    "Z": "centrality in its bin",
-}
-"""Score of RVA -> its meaning."""
-
 
 @click.command(
     epilog="""\b
@@ -96,22 +71,12 @@ Examples:
   cleargs show room                 all stages: state, time, size, figures
   cleargs show room rva             role and weight of each frame, and why
   cleargs show room rva --columns   the columns of the tables, with their meanings
-  cleargs show room g0 --rows 5     rows of each table, evenly spaced
-  cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
   cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
 )
 @run_argument
-@click.argument("stage", required=False)
-@click.option(
-    "--rows", type=click.IntRange(min=0), help="Rows of each table.  [default: 8 in tables of training steps]"
-)
-@click.option("--columns", is_flag=True, help="Describe the tables column by column.")
-@click.option(
-    "--plot",
-    is_flag=True,
-    help="For rva: draw trajectory, scores, roles, weights, and the best and worst frames.",
-)
+@click.argument("stage", required=False, shell_complete=completed(stage_names))
+@click.option("--columns", is_flag=True, help="List the columns of the tables, with their meanings.")
 @click.option(
     "--frame",
     type=click.IntRange(min=0),
@@ -122,7 +87,7 @@ Examples:
     "-o",
     "--output",
     type=FILE,
-    help=f"File of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
+    help="File of --frame (.png).  [default: RUN/frame-N.png]",
 )
 @json_option
 @click.pass_obj
@@ -130,24 +95,17 @@ def show(
     dag: Dag,
     run: Path,
     stage: str | None,
-    rows: int | None,
     columns: bool,
-    plot: bool,
     frame: int | None,
     output: Path | None,
     as_json: bool,
 ) -> None:
     """Show the results of the stages of RUN, or the tables of one STAGE."""
-    draws = output is not None and output.suffix.lower() == ".png" and (plot or frame is not None)
+    draws = output is not None and output.suffix.lower() == ".png" and frame is not None
     for cause, wrong, example in (
-        ("--plot needs the stage rva", plot and stage != "rva", "rva --plot"),
         ("--frame cannot be used with a stage", frame is not None and stage is not None, f"--frame {frame}"),
-        (
-            "--rows and --columns need the name of a stage",
-            stage is None and (columns or rows is not None),
-            "rva --columns",
-        ),
-        ("--output needs --plot or --frame, and a .png file", output and not draws, "rva --plot -o FILE.png"),
+        ("--columns needs the name of a stage", stage is None and columns, "rva --columns"),
+        ("--output needs --frame, and a .png file", output and not draws, "--frame 3 -o FILE.png"),
     ):
         if wrong:
             raise InputError(cause, hint=f"cleargs show {run} {example}")
@@ -162,14 +120,8 @@ def show(
             _print_run(settings, {name: done.get(name) for name in dag.names})
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
-    elif plot:
-        from cleargs.report.allocation_picture import plot_allocation
-
-        picture = output or run / PLOT
-        plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
-        answer(as_json, {"stage": stage, "plot": str(picture)}, f"written: {picture}")
     else:
-        _show_stage(run, done, stage, rows, columns, as_json)
+        _show_stage(run, done, stage, columns, as_json)
 
 
 def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
@@ -194,10 +146,8 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
             click.echo(f"preview: {preview.path}")
 
 
-def _show_stage(
-    run: Path, done: Mapping[str, Manifest], stage: str, rows: int | None, columns: bool, as_json: bool
-) -> None:
-    """Print the figures of a stage, and the requested tables."""
+def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bool, as_json: bool) -> None:
+    """Print the figures of a stage; of RVA all frames, or the columns of the tables."""
     manifest = done[stage]
     names = [name for name in sorted(manifest.files) if name.endswith(".parquet") and "/" not in name]
     tables = {name: read_any_table(run / stage / name) for name in names}
@@ -205,75 +155,32 @@ def _show_stage(
     if stage == "rva":
         repairs = read_any_table(run / "rivr" / "selection.parquet").to_pylist() if "rivr" in done else None
         frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
+    described = {
+        name: [(field.name, (field.metadata or {}).get(b"meaning", b"").decode()) for field in table.schema]
+        for name, table in tables.items()
+    }
     if as_json:
-        described = {
-            name: {"rows": data.num_rows, "columns": describe_table(data)} for name, data in tables.items()
+        facts = {
+            name: {"rows": tables[name].num_rows, "columns": dict(fields)}
+            for name, fields in described.items()
         }
         shown = {} if frames is None else {"frames": frames}
-        print_json({"stage": stage, **manifest_json(manifest), "tables": described, **shown})
+        print_json({"stage": stage, **manifest_json(manifest), "tables": facts, **shown})
         return
     lines = [("missing", missing) for missing in (*manifest.inherited, *manifest.missing)]
     lines += labelled(manifest.summary)
     lines.append(("time", f"{manifest.seconds:.1f} s on {manifest.device}, started {manifest.started}"))
     _print_table(lines, title=f"{stage}: {manifest.status}")
-    if frames is not None and not columns and rows is None:
+    if frames is not None and not columns:
         click.echo()
         named = ((row | {"name": short_name(row["name"])}).values() for row in frames)
         cells = ([f"{x:.2f}" if isinstance(x, float) else text_of(x) for x in row] for row in named)
         _print_table(cells, *frames[0] if frames else (), wraps="reason")  # fits in 80 columns
-        return
-    for name, data in tables.items():
-        wanted = rows if rows is not None else 8 if "step" in data.column_names and not columns else 0
-        title = f"{name}: {data.num_rows} rows"
-        if columns:
-            column_rows = (_column_row(*item) for item in describe_table(data).items())
-            heads = ("column", "min .. median .. max, or counts", "meaning")
-            _print_table(column_rows, *heads, title=f"\n{title}")
-        if wanted and data.num_rows:  # transposed: a row of the table is a column here
-            cells = ([text_of(value) for value in row.values()] for row in sampled_rows(data, wanted))
-            turned = zip(data.column_names, *cells, strict=True)
-            _print_table(turned, title="" if columns else f"\n{title}")
+    for name, fields in described.items() if columns else ():
+        title = f"\n{name}: {tables[name].num_rows} rows"
+        _print_table(fields, "column", "meaning", title=title, wraps="meaning")
     if not columns:
         click.echo(f"\nall columns: cleargs show {quote(str(run))} {stage} --columns")
-
-
-def describe_table(table: pa.Table) -> dict[str, dict[str, Any]]:
-    """Return column -> its type, meaning (from the field's metadata), number of nulls, and figures.
-
-    The figures of words and booleans are ``counts`` of each value, most frequent first, or ``distinct`` if
-    there are many values, or one per row. Those of numbers are ``min``, ``median``, ``mean`` and ``max`` of
-    the finite values.
-    """
-    described = {}
-    for field in table.schema:
-        column = table[field.name]
-        facts = {"type": str(field.type), "nulls": column.null_count, **_figures(column.drop_null())}
-        if meaning := (field.metadata or {}).get(b"meaning"):
-            facts["meaning"] = meaning.decode()
-        described[field.name] = facts
-    return described
-
-
-def _figures(values: pa.ChunkedArray) -> dict[str, Any]:
-    if pa.types.is_integer(values.type) or pa.types.is_floating(values.type):
-        finite = values.filter(pc.is_finite(values))
-        if not len(finite):
-            return {"distinct": 0}
-        median, mean = pc.quantile(finite, q=0.5)[0].as_py(), pc.mean(finite).as_py()
-        return {**pc.min_max(finite).as_py(), "median": median, "mean": mean}
-    counts = Counter(
-        str(value).lower() if isinstance(value, bool) else str(value) for value in values.to_pylist()
-    )
-    if len(counts) > MAX_COUNTED or 2 < len(counts) == len(values) or pa.types.is_list(values.type):
-        return {"distinct": len(counts)}
-    return {"counts": dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))}
-
-
-def sampled_rows(table: pa.Table, wanted: int) -> list[dict[str, Any]]:
-    """Return at most ``wanted`` rows, evenly spaced from the first to the last; the last one if only one."""
-    places = np.linspace(table.num_rows - 1, 0, min(wanted, table.num_rows)).round().astype(int)
-    rows: list[dict[str, Any]] = table.take(places[::-1]).to_pylist()
-    return rows
 
 
 def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -293,7 +200,7 @@ def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield from labelled(value, f"{label}: ")
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
             for number, item in enumerate(value, 1):
-                yield from labelled(item, f"round {number}: ")
+                yield from labelled(item, f"{'camera' if name == 'cameras' else 'round'} {number}: ")
         elif text := text_of(value):
             yield label, text
 
@@ -332,6 +239,8 @@ def frame_rows(
         settings: The settings of RVA that made these rows.
         repairs: The rows of ``rivr/selection.parquet``; None before RIVR, when frames have no "repair".
     """
+    from cleargs.report.frames import worst_cue
+
     latest = {row["frame_id"]: row for row in sorted(repairs or (), key=lambda row: int(row["round"]))}
     found = []
     for row in rows:
@@ -347,16 +256,6 @@ def short_name(name: str) -> str:
     """Return the end of a frame's name, which differs most between frames."""
     last = name.rpartition("/")[2]
     return last if len(last) <= MAX_NAME_LENGTH else f"…{last[1 - MAX_NAME_LENGTH :]}"
-
-
-def worst_cue(row: Mapping[str, Any]) -> str:
-    """Return the cue farthest from its best value, as "motion blur 0.82"; "" if all are good."""
-    off = {name: 1.0 - value for name, value in row.items() if name.startswith("r_") and value is not None}
-    off |= {name: value for name, value in row.items() if name.startswith("b_") and value is not None}
-    worst = max(off, key=lambda name: off[name], default="")
-    if not worst or off[worst] < MIN_FAULT:
-        return ""
-    return f"{worst[2:].replace('_', ' ')} {row[worst]:.2f}"
 
 
 def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
@@ -405,7 +304,7 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
 
     Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
-    from cleargs.report.frames import MEANINGS, camera_of, load_rows
+    from cleargs.report.frames import MEANINGS, camera_of, load_rows, worst_cue
     from cleargs.rivr.tables import REPAIRS
 
     if "ingest" not in done:
@@ -432,7 +331,7 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
         "picture": str(picture),
     }
     if not as_json:
-        _print_table(_lines(row, facts, run), title=f"frame {number}")
+        _print_table(_lines(row, facts), title=f"frame {number}")
     answer(as_json, facts, f"written: {picture}")
 
 
@@ -467,79 +366,46 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     return shown
 
 
-def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
-    """Yield label and text of each line about a frame."""
-    from cleargs.report.frames import CHOICES, scores_of
+def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield label and text of each line about a frame. ``--json`` has more."""
+    from cleargs.report.frames import CHOICES, EFFECTS, scores_of
 
     frame, judged = row.frame, facts["rva"]
     yield "file", frame.name
-    yield "image", f"{run / 'ingest' / frame.image}, {frame.width}x{frame.height} px"
     if frame.time_s is not None:
         yield "time", f"{frame.time_s:.2f} s"
     if frame.split == "test":
         yield "held out", "for testing; no training uses it"
-    if not frame.registered:
-        yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
-    else:
+    if frame.registered:
         centre = ", ".join(f"{value:.3f}" for value in facts["centre"])
-        quaternion = ", ".join(f"{facts[name]:.3f}" for name in ("qw", "qx", "qy", "qz"))
-        yield "pose", f"camera at ({centre}), world-to-camera rotation w, x, y, z ({quaternion})"
-        if frame.placed:
-            yield "placed by", frame.placed
-        yield "points", f"sees {frame.n_points} sparse points"
+        yield "pose", f"camera at ({centre}), sees {frame.n_points} sparse points"
+    else:
+        yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
     if judged:
         yield "role", f"{judged['role']}, weight {row.weight:.2f}: {judged['reason']}"
-        known = {name: value for name, value in judged.items() if value is not None}
-        yield (
-            "scores",
-            ", ".join(f"{name} {known[name]:.2f} {SCORES[name]}" for name in SCORES if name in known),
-        )
-        for label, prefix in (("quality, 0 to 1", "r_"), ("faults, 0 to 1", "b_")):
-            cues = (name for name in known if name.startswith(prefix))
-            yield label, ", ".join(f"{name[2:].replace('_', ' ')} {known[name]:.2f}" for name in cues)
+        known = ((name, judged[name]) for name in ("R", "B", "G") if judged[name] is not None)
+        yield "scores", ", ".join(f"{name} {value:.2f}" for name, value in known)
         yield "worst cue", judged["worst_cue"] or "none"
-    if row.gain_ev is not None:
-        yield "exposure", f"{row.gain_ev:+.2f} stops relative to the scene"
     if found := row.formation:
-        model = MODELS.get(found["model"], found["model"])
         if found["model"] == "none":
-            yield "formation", model
+            yield "formation", "nothing found"
         else:
-            share = f"{100 * found['explained']:.0f} %"
-            yield "formation", f"{model}, explains {share} of the misfit"
+            model = EFFECTS[found["model"]][0]
             lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
-            yield "", ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
-        yield (
-            "weight",
-            f"{found['weight_before']:.2f} before image formation, {found['weight_after']:.2f} after it",
-        )
+            sizes = ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
+            yield "formation", f"{model}, explains {100 * found['explained']:.0f} % of the misfit; {sizes}"
+        before, after = found["weight_before"], found["weight_after"]
+        yield "weight", f"{before:.2f} before image formation, {after:.2f} after it"
     for choice in row.rounds:
         refused = ", refused" if not choice.accepted and choice.chosen != "observed" else ""
         yield f"round {choice.round}", f"{CHOICES[choice.chosen]}{refused} ({choice.reason})"
         for metric, scores in scores_of(choice):
             yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
-        if choice.restored_from is None:
-            continue
-        moved = choice.blur_px is not None
-        motion = f": blur {choice.blur_px:.1f} px, skew {choice.skew_px:.1f} px" if moved else ""
-        yield "", f"restored from {SOURCES[choice.restored_from]}{motion}"
     if repair := facts["distilled"]:
         yield "final scene", f"trained on {CHOICES[repair['chosen']]} of round {repair['round']}"
 
 
 # -- on the terminal -----------------------------------------------------------------------------------------
-
-
-def _column_row(column: str, facts: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return name, figures and meaning of a column from `describe_table`, as text."""
-    if "counts" in facts:
-        words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
-    elif "median" in facts:
-        words = " .. ".join(text_of(facts[name]) for name in ("min", "median", "max"))
-    else:
-        words = f"{facts['distinct']} different"
-    empty = f", {facts['nulls']} empty" if facts["nulls"] else ""
-    return column, words + empty, facts.get("meaning", "")
 
 
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:
@@ -558,6 +424,7 @@ def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", 
         table.add_column(no_wrap=True)
     for column in table.columns:
         column.no_wrap |= bool(wraps) and column.header != wraps
+        column.min_width = 14 if column.header == wraps else None
     for row in rows:
         table.add_row(*row)
     Console(highlight=False, markup=False, emoji=False).print(table)

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 
-from cleargs.cli.common import json_option, parse_size, print_json
+from cleargs.cli.common import completed, json_option, parse_size, print_json
 from cleargs.cli.progress_bars import make_reporter
 
 PROTOCOL_HELP = (
     "Degradations: sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, tremor, gsotm-mb, "
-    "gsotm-rs, gsotm-mb-rs, gsotm-pn, camera or phone."
+    "gsotm-rs, gsotm-mb-rs, gsotm-pn, camera, phone, moving or moving-severe."
 )
+
+
+def _protocols() -> Iterable[str]:
+    from cleargs.synth.protocols import PROTOCOLS
+
+    return PROTOCOLS
 
 
 @click.command(
@@ -34,10 +41,17 @@ Protocols, with mean lengths at a width of 640 px:
   gsotm-mb, gsotm-rs, gsotm-mb-rs        motion blur of 8 px, rolling shutter of 12 px, or both
   gsotm-pn                               sharp frames with inexact poses
   phone                                  degradations of a phone's video
+  moving, moving-severe                  the same, with a person, a thing put elsewhere and a flicker
 """
 )
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--protocol", default="mixed", show_default=True, help=PROTOCOL_HELP)
+@click.option(
+    "--protocol",
+    default="mixed",
+    show_default=True,
+    shell_complete=completed(_protocols),
+    help=PROTOCOL_HELP,
+)
 @click.option(
     "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="Number of frames."
 )

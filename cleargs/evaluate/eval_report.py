@@ -95,6 +95,12 @@ class ImageResult(Figures):
     psnr_colour_aligned: float | None = Field(
         None, description="dB, after the colours were fitted to the reference by an affine on sRGB."
     )
+    psnr_white: float | None = Field(
+        None, description="dB, of the scene over white instead of its background; null for finished images."
+    )
+    psnr_between: float | None = Field(
+        None, description="dB, between the scene over its background (black unless set) and over white."
+    )
     refinement: Refinement | None = Field(None, description="Changes by pose refinement.")
     far: Region | None = Field(
         None,
@@ -120,6 +126,8 @@ class Evaluation(Figures):
     psnr_colour_aligned: float | None = Field(
         None, description="Mean of `psnr_colour_aligned` over the images; null if `align_colour` is set."
     )
+    psnr_white: float | None = Field(None, description="Mean of `psnr_white` over the images.")
+    psnr_between: float | None = Field(None, description="Mean of `psnr_between` over the images.")
     far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
     clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
@@ -212,6 +220,8 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             column(
                 "psnr_colour_aligned", pa.float64(), "dB, colours aligned to the reference", nullable=True
             ),
+            column("psnr_white", pa.float64(), "dB, of the scene over white", nullable=True),
+            column("psnr_between", pa.float64(), "dB, between background and white", nullable=True),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
             column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),

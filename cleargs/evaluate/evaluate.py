@@ -36,7 +36,7 @@ from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
 from cleargs.progress import Reporter
-from cleargs.splat.backend import rasteriser_for, set_threads
+from cleargs.splat.backend import decibels, rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
@@ -50,6 +50,8 @@ class _Prediction:
     """Image of a method at a reference's view, before colour alignment."""
 
     image: NDArray[np.float64]  # [H, W, 3] sRGB in [0, 1]
+    over_white: NDArray[np.float64] | None = None
+    """The same render over white; None for finished images."""
     refinement: Refinement | None = None
     far: MaskBool | None = None
     """Pixels in which a scene shows something behind the sparse points; None if these are not known."""
@@ -150,12 +152,12 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
     """Return a function that renders a scene at references' views, with poses refined in ``refine_steps``."""
     engine = rasteriser_for(scene.gaussians.device)
 
-    def render(camera: Camera) -> NDArray[np.float64]:
-        image = engine.forward(
-            scene.gaussians, camera, background=scene.background, antialias=scene.antialias
-        ).image
-        pixels: NDArray[np.float64] = image.numpy().astype(np.float64).clip(0.0, 1.0)
-        return pixels
+    def render(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the image over the scene's background, and over white."""
+        image, alpha, _ = engine.view(scene, camera)
+        pixels, through = image.numpy().astype(np.float64), 1.0 - alpha.numpy().astype(np.float64)
+        white = pixels + through[..., None] * (1.0 - np.array(scene.background))
+        return pixels.clip(0.0, 1.0), white.clip(0.0, 1.0)
 
     def depth_and_alpha(camera: Camera) -> tuple[PlaneF32, PlaneF32]:
         rendered = engine.forward(scene.gaussians, camera, antialias=scene.antialias, depth=True)
@@ -168,11 +170,13 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
             depth, alpha = depth_and_alpha(camera)
             shown = alpha > 0.5
             distance = float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
-            camera, refinement = refine_pose(render, camera, distance, target, mask, refine_steps)
+            camera, refinement = refine_pose(
+                lambda camera: render(camera)[0], camera, distance, target, mask, refine_steps
+            )
         farthest = None if points is None else depth_of_points(points, camera)
         if farthest is not None:
             far = far_pixels(*depth_and_alpha(camera), farthest)
-        return _Prediction(render(camera), refinement, far)
+        return _Prediction(*render(camera), refinement, far)
 
     return predict
 
@@ -195,14 +199,14 @@ def _evaluate(
 
     def measured(name: str, prediction: _Prediction, target: ImageU8, mask: MaskBool | None) -> ImageResult:
         image, affine, aligned_psnr = prediction.image, None, None
+        everywhere = np.ones(target.shape[:2], bool)
         fitted = fit_affine(image, target / 255.0, mask)
         aligned = apply_affine(image, fitted)
         if options.align_colour:
             image, affine = aligned, fitted
         else:
-            everywhere = np.ones(target.shape[:2], bool)
             aligned_psnr = region(to_uint8(aligned), target, everywhere, mask).psnr
-        pixels = to_uint8(image)
+        pixels, white = to_uint8(image), prediction.over_white
         if save is not None:
             write_rgb(save / f"{name}.png", pixels)
         return ImageResult(
@@ -214,6 +218,10 @@ def _evaluate(
             reference=_digest(target, mask),
             colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
             psnr_colour_aligned=aligned_psnr,
+            psnr_white=None if white is None else region(to_uint8(white), target, everywhere, mask).psnr,
+            psnr_between=None
+            if white is None
+            else decibels(float(np.square(white - prediction.image).sum()), white.size),
             refinement=prediction.refinement,
             far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
             clipped=region(pixels, target, clipped_pixels(target), mask),
@@ -245,6 +253,8 @@ def _evaluate(
         options=options,
         means=mean_values(images, options.metrics),
         psnr_colour_aligned=mean_of(image.psnr_colour_aligned for image in images),
+        psnr_white=mean_of(image.psnr_white for image in images),
+        psnr_between=mean_of(image.psnr_between for image in images),
         far=pooled(image.far for image in images),
         clipped=pooled(image.clipped for image in images),
         unavailable=dict(metrics.unavailable),

@@ -102,7 +102,8 @@ def reference_of(
         directory: folder with ``images/`` and ``transforms.json`` in the world of the run's input. None: the
             frames that the run held out.
         poses: render at the reference's poses, or at the run's own poses of the frames of the same stems.
-        align: folder of the cameras that align the worlds; None: ``directory``.
+        align: folder of the cameras that align the worlds; None: ``observed`` next to ``directory`` if
+            there is one, or else ``directory``.
         reporter: shows remarks.
 
     Raises:
@@ -136,6 +137,9 @@ def reference_of(
             alignment = Alignment(world="scene", matched=len(views))
         else:
             if manifest.summary.get("poses") in ("sfm", "refined"):
+                observed = directory.parent / "observed"  # synthetic captures have it
+                if align is None and (observed / "transforms.json").is_file():
+                    align = observed
                 known = listed if align is None else _listed(align)
                 stems = matching(known, own, hint)
                 theirs, ours = [known[stem].pose for stem in stems], [own[stem] for stem in stems]

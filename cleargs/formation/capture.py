@@ -1,9 +1,10 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-The first look at a frame searches it. The next looks follow after every `FormationConfig.every` steps on it.
-They refine its motion with the scene of that time. A test of a few milliseconds (`pretest`) says if blur is
-left that nothing explains, and only then the frame is searched again. The sharper the scene becomes, the more
-blur the test finds.
+The first look at a frame searches it, except in a draft. The next looks follow after every
+`FormationConfig.every` steps on it. They refine its motion with the scene of that time. A test of a few
+milliseconds (`pretest`) says if blur is left that nothing explains, and only then the frame is searched
+again. The sharper the scene becomes, the more blur the test finds. At every fourth look a path of a higher
+order is tried.
 
 Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
 is searched at the first look of a training and at every fourth one, since the test cannot see a skew.
@@ -15,7 +16,6 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from statistics import median
 
 import numpy as np
@@ -25,11 +25,13 @@ from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, fit_motion, packed, unpacked
-from cleargs.formation.observed import FormedView, pixel_weights
+from cleargs.formation.movement import Movement
+from cleargs.formation.observed import FormedView
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
-from cleargs.splat.types import group
+from cleargs.splat.types import Render, group
 from cleargs.splat.views import TrainingView
+from cleargs.types import MaskBool
 
 ROLLING = 0.015
 """Share of the misfit that a rolling shutter must explain in addition to all else, in half of a capture's
@@ -41,7 +43,8 @@ skewed frames. At a place that few frames see, it hides a skew before `Formation
 DOUBTED = 0.5
 """Weight by RVA below which a frame is doubted."""
 SEARCH_EVERY = 4
-"""Looks at a frame from one search to the next where the shutter rolls."""
+"""Looks at a frame from one try of a higher order to the next, and where the shutter rolls from one search to
+the next."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
@@ -79,6 +82,8 @@ class CaptureFormation:
         exposure: Exposure | None = None,
         lr_exposure: float = 0.0,
         known: Mapping[int, FrameFormation] | None = None,
+        moving: Mapping[int, MaskBool] | None = None,
+        draft: bool = False,
     ) -> None:
         """Begin with what is known of the frames.
 
@@ -88,9 +93,11 @@ class CaptureFormation:
             exposure: Colour affines to begin with; None for a training without any.
             lr_exposure: Learning rate of the affines.
             known: Formations that an earlier training has found, by frame_id.
+            moving: Cells that move, by frame_id, from an earlier training.
+            draft: Search frames only where the test finds blur, also at the first look.
         """
         weighted = [view for view in views if view.weight > 0.0]
-        self._config = config
+        self._config, self._draft = config, draft
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
         real = sorted(view.frame_id for view in weighted if view.kind == "real")
         known = known or {}
@@ -99,6 +106,11 @@ class CaptureFormation:
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
+        estimated = {view.frame_id for view in weighted if view.kind == "real" and view.estimated}
+        self._posed = {"auto": estimated, "on": set(real), "off": set[int]()}[config.pose]
+        cameras = {view.frame_id: view.camera for view in weighted}
+        self._movement = Movement(cameras, config.unexplained, moving)
+        self._draws = dict.fromkeys(cameras, 0)
 
     @property
     def exposure(self) -> Exposure | None:
@@ -109,6 +121,11 @@ class CaptureFormation:
     def frames(self) -> dict[int, FrameFormation]:
         """Formations of the raw frames, by frame_id."""
         return dict(self._frames)
+
+    @property
+    def moving(self) -> dict[int, MaskBool]:
+        """Cells that move [rows, columns], of the frames in which some do, by frame_id."""
+        return self._movement.masks()
 
     def weight(self, frame_id: int) -> float:
         """Return the weight of a raw frame in the training: RVA's, or what it has earned if that is more.
@@ -138,6 +155,7 @@ class CaptureFormation:
         frame_id, camera = view.frame_id, view.camera.scaled(factor)
         affines = self._affines
         affine = None if affines is None else affines.affine(frame_id)
+        own, mask = mask, self._movement.still(frame_id, mask, target)
 
         def explained() -> FrameFormation:
             """Return the frame's formation, estimated with the present scene."""
@@ -151,10 +169,12 @@ class CaptureFormation:
                 mask,
                 render,
                 factor=factor,
+                pose=frame_id in self._posed,
                 doubted=self._weights[frame_id] < DOUBTED,
                 rolling=self._rolls(),
                 again=(frame.draws // self._config.every) % SEARCH_EVERY == 0,
                 test_rolling=frame_id in self._tested and frame.skew_gain is None,
+                draft=self._draft,
             )
 
         begun = progress >= self._config.start
@@ -175,11 +195,17 @@ class CaptureFormation:
             weight = self.weight(frame_id)
             if frame.model != "none":
                 motion = frame
-        robust_mask = None
-        if begun and self._config.unexplained > 0.0:
-            tolerance = self._config.unexplained
-            robust_mask = partial(pixel_weights, target=target, mask=mask, tolerance=tolerance)
-        if motion is None and affine is None and robust_mask is None:
+
+        def look(image: Tensor, rendered: Render, margin: int) -> Tensor | None:
+            """Find what moves in the frame, and return the pixels that count."""
+            self._movement.look(frame_id, image, rendered, margin, target, own)
+            return self._movement.still(frame_id, own, target)
+
+        looks = False
+        if view.kind == "real" or frame_id not in self._frames:
+            looks = self._movement.due(self._draws[frame_id], progress)
+            self._draws[frame_id] += 1
+        if motion is None and affine is None and mask is own and not looks:
             return None
         return FormedView(
             camera,
@@ -189,7 +215,8 @@ class CaptureFormation:
             affines=affines,
             formation=motion,
             factor=factor,
-            robust_mask=robust_mask,
+            mask=mask,
+            look=look if looks else None,
         )
 
     def digest(self) -> str:
@@ -202,7 +229,8 @@ class CaptureFormation:
 
     def state(self) -> dict[str, Tensor]:
         """Return the numbers of all frames, and the affines with their moments."""
-        state = {"frames": torch.from_numpy(packed(self._frames.values()))}
+        state = {"frames": torch.from_numpy(packed(self._frames.values())), **self._movement.state()}
+        state["movement.draws"] = torch.tensor(list(self._draws.values()))
         if self._affines is not None:
             for name, array in self._affines.arrays().items():
                 state[f"exposure.{name}"] = torch.from_numpy(array)
@@ -210,6 +238,8 @@ class CaptureFormation:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Resume from what `state` gave."""
+        self._movement.restore(state)
+        self._draws = dict(zip(self._draws, state["movement.draws"].tolist(), strict=True))
         self._frames = {frame.frame_id: frame for frame in unpacked(state["frames"].numpy())}
         if self._affines is not None:
             affines = group(state, "exposure.")

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.motion import FrameMotion, Model, flow_basis, widened
+from cleargs.formation.motion import BEND, FrameMotion, Model, flow_basis, widened
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.backend import SearchKernels
@@ -167,7 +167,7 @@ class Level:
     @cached_property
     def _still(self) -> float:
         """Misfit without any motion."""
-        fields = self._nowhere, self._nowhere, self._nowhere[0]
+        fields = self._nowhere, self._nowhere, self._nowhere[0], None
         total = self._kernels.misfit(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
         return total / self._total
 
@@ -184,11 +184,13 @@ class Level:
         return self._misfit(motion, times, self._fitting)
 
     def _misfit(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
-        fields = self.fields(motion)
+        fields = self.fields(motion, curved=motion.order > 1)
         return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
-    def fields(self, motion: FrameMotion) -> tuple[ArrayF32, ArrayF32, ArrayF32]:
-        """Return offset, sweep and radius: see `DisplacementFields`."""
+    def fields(
+        self, motion: FrameMotion, curved: bool
+    ) -> tuple[ArrayF32, ArrayF32, ArrayF32, ArrayF32 | None]:
+        """Return offset, sweep, radius and, where ``curved``, curve: see `DisplacementFields`."""
 
         def flow(twist: ArrayF64) -> ArrayF32:
             if not twist.any():
@@ -203,11 +205,13 @@ class Level:
         if motion.disc_px > 0.0:
             disc = np.float32(motion.disc_px * self.scale)
             radius = np.abs(self.nearness - np.float32(motion.focus)) * disc
-        return offset, flow(motion.blur), radius
+        curve = np.concatenate([flow(motion.bend), flow(motion.cube)]) if curved else None
+        return offset, flow(motion.blur), radius, curve
 
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:
         """Return matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
-        offset, sweep, _ = self.fields(motion)
+        curved = bool((active >= BEND.start).any()) or motion.order > 1
+        offset, sweep, _, curve = self.fields(motion, curved)
         return self._kernels.normal_equations(
             self._stack,
             self._observed,
@@ -216,6 +220,7 @@ class Level:
             self._down,
             offset,
             sweep,
+            curve,
             FINE[:, 0].copy(),
             OUTLIER,
             active,

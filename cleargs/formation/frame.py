@@ -14,15 +14,15 @@ from torch import Tensor
 
 from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit, explained_share, luminance
 from cleargs.formation.exposure import apply_affine
-from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model, widened
+from cleargs.formation.motion import MODELS, TWISTS, FrameMotion, Model, widened
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
 from cleargs.formation.search import blur_along, preferred, refine, search
-from cleargs.formation.warp import Warp, displacement_fields
+from cleargs.formation.warp import Warp, displacement_fields, path_lengths
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
-from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
+from cleargs.splat.kernels.warp_layout import BEND_REACH, CHANNELS, CUBE_REACH, DisplacementFields
 from cleargs.splat.types import Render
 
 EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
@@ -39,7 +39,7 @@ MARGIN_SHARE = 0.25
 LENS = ("disc_px", "focus", "median_depth")
 MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
 """Numbers of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
-TWISTS, AXES = ("pose", "blur", "skew"), ("tx", "ty", "tz", "rx", "ry", "rz")
+AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,12 @@ def fit_motion(
     render: Renderer,
     *,
     factor: float = 1.0,
+    pose: bool = False,
     doubted: bool = False,
     rolling: bool = False,
     test_rolling: bool = False,
     again: bool = False,
+    draft: bool = False,
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
@@ -109,10 +111,12 @@ def fit_motion(
         mask: Its mask, [H, W].
         render: Renders the scene with depth.
         factor: Size of ``camera`` over that of the frame.
+        pose: Correct the pose together with a motion.
         doubted: RVA doubts the frame, so less evidence is needed for a search.
         rolling: Admit models with a skew.
         test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
-        again: Search a frame of a rolling shutter again.
+        again: Try a path of a higher order, and search a frame of a rolling shutter again.
+        draft: Search the first time, too, only if the test finds blur.
     """
     # A formation that was found under the other assumption about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
@@ -122,11 +126,12 @@ def fit_motion(
     pair = frame_pair(rendered, affine, target, mask, camera, margin)
     kernels = backend_for(rendered.image.device)
     known = _scaled(frame.motion, factor)
-    found = refine(pair, frame.model, known, pose=config.pose, kernels=kernels)
-    best = _accepted(found[-1], found[0], frame.model, config)
+    found = refine(pair, frame.model, known, pose=pose, curve=again, kernels=kernels)
+    followed = preferred(found[1:] or found)
+    best = _accepted(followed, found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
     skews = rolling or test_rolling
-    first = frame.draws == 0  # a scene that is still soft hides short blurs from the test
+    first = frame.draws == 0 and not draft  # a scene that is still soft hides short blurs from the test
     asked = first or untested or test_rolling or (rolling and again) or not _admitted(frame.model, rolling)
     enough = DOUBTED_EVIDENCE if doubted else EVIDENCE
     if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
@@ -135,19 +140,18 @@ def fit_motion(
             margin, rendered = wide, render(widened(camera, wide))
             pair = frame_pair(rendered, affine, target, mask, camera, margin)
         whole = evidence if best.model == "none" else _unexplained(pair, rendered, found[0])
-        before = found[-1]
         found = search(
             pair,
             start=None if skews else blur_along(whole.length, whole.angle),
             skew=skews,
             defocus=skews or whole.disc_gain > whole.line_gain,
-            pose=config.pose,
+            pose=pose,
             kernels=kernels,
         )
         if skews:
             frame = replace(frame, skew_gain=_skew_gain(found))
-        if before.model != "none":
-            found += refine(pair, before.model, before.motion, pose=config.pose, kernels=kernels)[1:]
+        if followed.model != "none":
+            found += refine(pair, followed.model, followed.motion, pose=pose, kernels=kernels)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
         best = _accepted(best, found[0], frame.model, config)
     return _described(frame, best, factor, camera, rendered, margin)
@@ -226,15 +230,15 @@ def _described(
     def fields(of: FrameMotion) -> DisplacementFields:
         return displacement_fields(of, camera, depth, alpha, margin, factor)
 
-    whole, turned = fields(motion), fields(replace(motion, pose=np.zeros(TWIST), blur=motion.skew))
+    whole, turned = fields(motion), fields(FrameMotion(blur=motion.skew, median_depth=motion.median_depth))
     return replace(
         frame,
         motion=motion,
         model=best.model,
         misfit=best.misfit,
         misfit_still=best.misfit_still,
-        blur_px=_mean_length(whole.sweep) / factor,
-        skew_px=_mean_length(turned.sweep) / factor,
+        blur_px=float(path_lengths(whole).mean(dtype=np.float64)) / factor,
+        skew_px=float(path_lengths(turned).mean(dtype=np.float64)) / factor,
         defocus_px=float(whole.radius.cpu().numpy().mean(dtype=np.float64)) / factor,
         reach_px=reach_of(whole) / factor,
     )
@@ -243,11 +247,9 @@ def _described(
 def reach_of(fields: DisplacementFields) -> float:
     """Return the reach of the pixels, px: see `FrameFormation.reach_px`."""
     displacements = fields.offset.abs() + 0.5 * fields.sweep.abs() + fields.radius
+    if fields.curve is not None:
+        displacements += BEND_REACH * fields.curve[:2].abs() + CUBE_REACH * fields.curve[2:].abs()
     return float(np.quantile(displacements.amax(dim=0)[::4, ::4].cpu().numpy(), 0.95))
-
-
-def _mean_length(field: Tensor) -> float:
-    return float(np.hypot(*field.cpu().numpy()).mean(dtype=np.float64))
 
 
 def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
@@ -268,13 +270,13 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
     row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws")}
     for name in TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
-    row |= {name: getattr(motion, name) for name in LENS}
+    row |= {name: getattr(motion, name) for name in LENS} | {"order": motion.order}
     return row | {name: getattr(frame, name) for name in (*MEASURED, "skew_gain")}
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame of which `as_row` gave this row; an older table has no ``draws``."""
-    vector = np.array([row[f"{name}_{axis}"] for name in TWISTS for axis in AXES])
+    """Return the frame of which `as_row` gave this row; an older table has no ``draws`` and no curves."""
+    vector = np.array([row.get(f"{name}_{axis}") or 0.0 for name in TWISTS for axis in AXES])
     return FrameFormation(
         row["frame_id"],
         FrameMotion(**{name: row[name] for name in LENS}).with_vector(vector),

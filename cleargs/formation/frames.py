@@ -15,6 +15,10 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.views import TrainingView
 from cleargs.types import AnyImage, MaskBool
 
+GIVEN = "given"
+"""Value of ``placed`` in ``ingest/frames.parquet`` of a pose of the input that fits the images: features miss
+their points by no more than ``ingest.refine_above`` (median). Ingest adjusts other poses or finds them."""
+
 
 def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
     """Return the view of a registered frame, whose files are in ``folder`` (the ingest folder)."""
@@ -32,7 +36,8 @@ def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
     pose[:3, 3] = translation
     camera = Camera(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy, pose)
     image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
-    return TrainingView(frame.frame_id, camera, weight, "real", partial(_load, image, mask))
+    estimated = frame.placed not in (None, GIVEN)
+    return TrainingView(frame.frame_id, camera, weight, "real", partial(_load, image, mask), estimated)
 
 
 def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[TrainingView]:

@@ -13,6 +13,12 @@ from cleargs.types import ArrayF32, ArrayF64
 TWIST = 6
 """Numbers of a twist: translation by x, y, z, then rotation about them, in camera axes."""
 
+TWISTS = ("pose", "blur", "skew", "bend", "cube")
+"""Names of a motion's twists, in the order of its numbers."""
+
+POSE, BLUR, SKEW, BEND, CUBE = (slice(k * TWIST, (k + 1) * TWIST) for k in range(len(TWISTS)))
+"""Places of the twists in `FrameMotion.vector`."""
+
 Model: TypeAlias = Literal["none", "blur", "skew", "both", "defocus"]
 """Model that explains a frame; ``both`` is blur and skew."""
 
@@ -30,14 +36,22 @@ class FrameMotion:
     Twists [6] give the motion of the scene past the camera, in camera axes; the camera
     moved the other way.
     They are in pixels: a rotation by angle a is fx * a, a translation by d is fx * d / median depth.
+
+    At time t of a row's exposure, from -1/2 to 1/2, the scene has moved by
+    pose + t blur + (t^2 - 1/12) bend + (t^3 - 3t/20) cube. The polynomials are orthogonal, so that a
+    higher order leaves the mean pose and the lower orders as they are.
     """
 
     blur: ArrayF64 = field(default_factory=_still)
-    """From the start to the end of a row's exposure."""
+    """From the start to the end of a row's exposure, by the part of the path that is linear in time."""
     skew: ArrayF64 = field(default_factory=_still)
     """From the first to the last row's exposure: the rolling shutter. The middle row has the frame's pose."""
     pose: ArrayF64 = field(default_factory=_still)
-    """From the frame's pose as given to that at the middle of its exposure."""
+    """From the frame's pose as given to the mean pose of its exposure."""
+    bend: ArrayF64 = field(default_factory=_still)
+    """Factor of t^2 - 1/12 in the path at time t of the exposure, from -1/2 to 1/2."""
+    cube: ArrayF64 = field(default_factory=_still)
+    """Factor of t^3 - 3t/20."""
     disc_px: float = 0.0
     """Radius of the disc of defocus, pixels per unit of nearness beyond the focus."""
     focus: float = 1.0
@@ -46,13 +60,18 @@ class FrameMotion:
 
     @property
     def vector(self) -> ArrayF64:
-        """Pose, blur and skew, [18]."""
-        return np.concatenate([self.pose, self.blur, self.skew])
+        """Pose, blur, skew, bend and cube, [30]."""
+        return np.concatenate([getattr(self, name) for name in TWISTS])
 
     def with_vector(self, vector: ArrayF64) -> FrameMotion:
-        """Return this motion with another pose, blur and skew [18]."""
-        pose, blur, skew = vector.reshape(3, TWIST)
-        return replace(self, pose=pose, blur=blur, skew=skew)
+        """Return this motion with the twists of another `vector`."""
+        pose, blur, skew, bend, cube = vector.reshape(len(TWISTS), TWIST)
+        return replace(self, pose=pose, blur=blur, skew=skew, bend=bend, cube=cube)
+
+    @property
+    def order(self) -> int:
+        """Order of the path in time: 1 straight (or none), 2 quadratic, 3 cubic."""
+        return 3 if self.cube.any() else 2 if self.bend.any() else 1
 
 
 def widened(camera: Camera, margin: int) -> Camera:
@@ -88,3 +107,23 @@ def flow_basis(
     along_y = np.stack([none, -nearness, y * nearness, 1 + y * y, -x * y, -x]) * (camera.fy / camera.fx)
     scales = width / camera.width, height / camera.height
     return np.stack([scales[0] * along_x, scales[1] * along_y], axis=1).astype(np.float32)
+
+
+def pixel_paths(
+    motion: FrameMotion, camera: Camera, shape: tuple[int, int], times: ArrayF64
+) -> ArrayF64:  # [T, rows, columns, 2] px
+    """Return the displacements of the pixels at the centres of a grid at ``times`` of the exposure.
+
+    They are those at the median depth, relative to the mean of the exposure.
+
+    Args:
+        motion: The frame's motion.
+        camera: Its camera.
+        shape: Rows and columns of the grid.
+        times: Times from -1/2 to 1/2.
+    """
+    basis = flow_basis(camera, np.ones(shape, np.float32)).astype(np.float64)
+    basis *= np.array([camera.width / shape[1], camera.height / shape[0]])[:, None, None]
+    orders = np.stack([times, times**2 - 1 / 12, times**3 - 3 * times / 20])
+    twists = np.stack([motion.blur, motion.bend, motion.cube])
+    return np.asarray(np.einsum("ot,on,ncij->tijc", orders, twists, basis))

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure, affine_backward, apply_affine
 from cleargs.formation.frame import FrameFormation, margin_for
 from cleargs.formation.motion import widened
+from cleargs.formation.movement import counted
 from cleargs.formation.warp import (
     Warp,
     displacement_fields,
@@ -30,50 +30,15 @@ from cleargs.splat.kernels.warp_layout import CHANNELS
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
-
-ERROR_CELLS = 24
-"""Cells along the longer side of a frame. Over a cell, detail that is missing or a little out of place
-cancels out. A thing that does not belong to the scene does not."""
-
-MEDIAN_FACTOR = 5.0
-"""Multiple of the frame's median difference up to which a difference is ordinary. In a frame that differs
-everywhere, as with an unknown exposure, nothing moves."""
-
-EPSILON = 1e-6
-"""Difference, and share of the pixels, that replaces zero in a division."""
-
-
-def pixel_weights(
-    render: Tensor,  # [H, W, 3] sRGB
-    target: Tensor,  # [H, W, 3] sRGB
-    mask: Tensor | None,  # [H, W], True counts
-    tolerance: float,
-) -> Tensor:
-    """Return weights [H, W] in (0, 1] of the pixels of ``target``, which ``render`` must explain.
-
-        w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
-
-    r is the difference of the mean colours of a cell, in sRGB of [0, 1], interpolated between the cells. If
-    it is below rho, w is exactly 1. Source of the pooling: Sabour et al., "RobustNeRF" (2023).
-    """
-    height, width = render.shape[:2]
-    per_pixel = ERROR_CELLS / max(height, width)
-    cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
-    counted = torch.ones_like(render[..., 0]) if mask is None else mask.float()
-    difference = (render - target).permute(2, 0, 1) * counted
-    shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(EPSILON)
-    unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
-    ordinary = (MEDIAN_FACTOR * unexplained.median()).clamp_min(tolerance)
-    here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
-    return (ordinary / here.clamp_min(EPSILON)).clamp_max(1.0).square()
+from cleargs.types import MaskBool
 
 
 @dataclass(eq=False)
 class FormedView:
     """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
-    ``robust_mask`` gives the weight of each pixel [H, W] of a photograph (see `pixel_weights`); None gives
-    all the same weight.
+    ``look`` gets each photograph with its render and margin, and returns the pixels that count: see
+    `cleargs.formation.movement`.
     """
 
     camera: Camera
@@ -83,7 +48,8 @@ class FormedView:
     affines: AffineOptimiser | None = None
     formation: FrameFormation | None = None
     factor: float = 1.0
-    robust_mask: Callable[[Tensor], Tensor] | None = None
+    mask: Tensor | None = None
+    look: Callable[[Tensor, Render, int], Tensor | None] | None = None
 
     def __post_init__(self) -> None:
         """Widen the camera by the margin that the formation needs."""
@@ -92,7 +58,7 @@ class FormedView:
         if self.formation is not None:
             self._margin = margin_for(self.formation.reach_px * self.factor, self._frame_camera)
             self.camera = widened(self._frame_camera, self._margin)
-        self.needs_depth = self.formation is not None
+        self.needs_depth = self.formation is not None or self.look is not None
 
     def forward(self, render: Render) -> Tensor:
         """Return the photograph [H, W, 3] sRGB of a render at ``camera``."""
@@ -104,8 +70,8 @@ class FormedView:
             self._warp = self.warp(render)
             linear, self._to_linear = through_curve(image, linear_curve(device), CHANNELS)
             image, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(device))
-        if self.robust_mask is not None:
-            self._counts = self.robust_mask(image)
+        if self.look is not None:
+            self.mask = self.look(image, render, self._margin)
         return image
 
     def warp(self, render: Render) -> Warp:
@@ -118,8 +84,6 @@ class FormedView:
 
     def backward(self, gradient: Tensor) -> Tensor:
         """Return the gradient by the render's image, from that by the photograph."""
-        if self.robust_mask is not None:
-            gradient = gradient * self._counts[..., None]
         if self.formation is not None:
             light = times_slope(gradient, self._to_srgb, CHANNELS)
             gradient = times_slope(self._warp.transpose(light), self._to_linear)
@@ -185,15 +149,20 @@ def evaluate_views(
     exposure: Exposure | None = None,
     formations: Mapping[int, FrameFormation] | None = None,
     *,
+    moving: Mapping[int, MaskBool] | None = None,
     engine: Rasteriser | None = None,
 ) -> list[Fit]:
-    """Compare the scene with every view as photographed, in their order, at full size."""
+    """Compare the scene with every view as photographed, in their order, at full size.
+
+    Pixels of the cells ``moving``, by frame_id, do not count (see `cleargs.formation.movement`).
+    """
     engine = engine or rasteriser_for(str(scene.gaussians.device))
     images = ImageCache(0, scene.gaussians.device)
     formations = formations or {}
     fits = []
     for view in views:
         target, mask = images.get(view)
+        mask = counted(mask, (moving or {}).get(view.frame_id), target)
         image = render_observed(scene, view, exposure, formations.get(view.frame_id), engine=engine)
         unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
         unseen = unseen if mask is None else unseen & mask

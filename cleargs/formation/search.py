@@ -21,7 +21,7 @@ from cleargs.formation.comparison import (
     MotionFit,
     scales,
 )
-from cleargs.formation.motion import TWIST, FrameMotion, Model
+from cleargs.formation.motion import BEND, BLUR, CUBE, POSE, SKEW, TWIST, TWISTS, FrameMotion, Model
 from cleargs.splat.backend import SearchKernels
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.types import ArrayF64
@@ -51,7 +51,11 @@ zero."""
 CONVERGED = 1e-3
 MAX_TRIES = 4
 
-POSE, BLUR, SKEW = (slice(k * TWIST, (k + 1) * TWIST) for k in range(3))
+MAX_ORDER = 3
+"""Highest order of a path in time."""
+ORDER_PENALTY = 0.005
+"""Share of the misfit without any motion that each further order of the path must explain to be preferred."""
+
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
 
@@ -76,7 +80,7 @@ def search(
         kernels: Back end that computes misfits and normal equations.
 
     Returns:
-        The fit of ``none`` first, then one of each model.
+        The fit of ``none`` first, then one of each model, those with a blur by the order of the path.
     """
     levels = [Level(pair, scale, kernels) for scale in scales(pair)]
     coarse = levels[0]
@@ -84,18 +88,22 @@ def search(
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
     starts = _starts(coarse, still) if start is None else _near(coarse, still, start)
     begun = _best(coarse, starts, models[0], LEVELS[0][1], pose)
-    found: dict[Model, FrameMotion] = {}
+    found: list[tuple[Model, FrameMotion]] = [("none", still)]
     for model in models:
         motion = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
             motion = _best(level, [motion, still], model, steps, pose)
-        found[model] = motion
+        found.append((model, motion))
+        if BLUR in _ACTIVE[model] and motion.blur.any():
+            for order in range(2, MAX_ORDER + 1):
+                motion = _best(levels[-1], [motion], model, LEVELS[-1][1], pose, order)
+                found.append((model, motion))
     if defocus:
         disc = _sharpest_disc(coarse, still)
         for level in levels[1:]:
             disc = _narrowed(level, disc)
-        found["defocus"] = disc
-    return [levels[-1].evaluate("none", still), *(levels[-1].evaluate(name, found[name]) for name in found)]
+        found.append(("defocus", disc))
+    return [levels[-1].evaluate(model, motion) for model, motion in found]
 
 
 def refine(
@@ -104,12 +112,21 @@ def refine(
     motion: FrameMotion,
     *,
     pose: bool = False,
+    curve: bool = False,
     kernels: SearchKernels = cpu,
 ) -> list[MotionFit]:
     """Fit ``model`` again from the numbers of the last fit, at the finest level.
 
+    Args:
+        pair: The frame and the render.
+        model: The model.
+        motion: The last fit.
+        pose: Correct the pose, too.
+        curve: Try the next order of the path, too.
+        kernels: Back end that computes misfits and normal equations.
+
     Returns:
-        The fit of ``none`` first, then that of ``model`` where it is another.
+        The fit of ``none`` first, then that of ``model`` where it is another, then that of the next order.
     """
     level = Level(pair, scales(pair)[-1], kernels)
     if model == "none":
@@ -117,28 +134,43 @@ def refine(
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
-        motion = _narrowed(level, motion)
+        paths = [_narrowed(level, motion)]
     else:
-        motion = _best(level, [motion], model, WARM_STEPS, pose)
-    return [level.evaluate("none", still), level.evaluate(model, motion)]
+        order = motion.order
+        paths = [_best(level, [motion], model, WARM_STEPS, pose, order)]
+        if curve and order < MAX_ORDER and BLUR in _ACTIVE[model]:
+            paths.append(_best(level, paths, model, WARM_STEPS, pose, order + 1))
+    return [level.evaluate("none", still), *(level.evaluate(model, path) for path in paths)]
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
-    """Return the model with the least misfit on the held-out pixels; each further motion has a price."""
-    return min(found, key=lambda e: e.misfit * (1.0 + MODEL_PENALTY * _PARTS[e.model]))
+    """Return the fit with the least misfit on the held-out pixels.
+
+    Each further motion has a price, and each further order of the path.
+    """
+
+    def cost(fit: MotionFit) -> float:
+        model = fit.misfit * (1.0 + MODEL_PENALTY * _PARTS[fit.model])
+        return model + ORDER_PENALTY * fit.misfit_still * (fit.motion.order - 1)
+
+    return min(found, key=cost)
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
-    vector = np.zeros(3 * TWIST)
+    vector = np.zeros_like(motion.vector)
     for part in (POSE, *_ACTIVE[model]):
         vector[part] = motion.vector[part]
     return motion.with_vector(vector)
 
 
-def _best(level: Level, starts: list[FrameMotion], model: Model, steps: int, pose: bool) -> FrameMotion:
-    """Return the best end of the descents from ``starts``."""
-    parts = (POSE, *_ACTIVE[model]) if pose else _ACTIVE[model]
-    active = np.concatenate([np.arange(3 * TWIST)[part] for part in parts])
+def _best(
+    level: Level, starts: list[FrameMotion], model: Model, steps: int, pose: bool, order: int = 1
+) -> FrameMotion:
+    """Return the best end of the descents from ``starts`` with a path of ``order``."""
+    parts = [*_ACTIVE[model], *((BEND, CUBE)[: order - 1])]
+    active = np.concatenate(
+        [np.arange(len(TWISTS) * TWIST)[part] for part in ([POSE] if pose else []) + parts]
+    )
     ends = [_descend(level, start, active, steps) for start in starts]
     return min(ends, key=level.cost)
 

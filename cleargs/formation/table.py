@@ -12,9 +12,11 @@ from cleargs.formation.frame import AXES, FrameFormation, as_row, from_row
 from cleargs.parquet import column, read_table, write_table
 
 _TWISTS = {
-    "pose": "of the scene past the camera from the pose as given to that at the middle of the exposure",
-    "blur": "of the scene past the camera from the start to the end of a row's exposure",
+    "pose": "of the scene past the camera from the pose as given to the mean pose of the exposure",
+    "blur": "of the scene past the camera from the start to the end of a row's exposure, linear in time",
     "skew": "of the scene past the camera from the first to the last row's exposure",
+    "bend": "of the scene past the camera, times t^2 - 1/12 at time t of the exposure, -1/2 to 1/2",
+    "cube": "of the scene past the camera, times t^3 - 3t/20 at time t of the exposure, -1/2 to 1/2",
 }
 
 
@@ -24,6 +26,7 @@ def _twist(name: str) -> list[pa.Field]:
             f"{name}_{axis}",
             pa.float64(),
             f"{axis} {_TWISTS[name]}, px: t times fx / median depth, r times fx",
+            nullable=name in ("bend", "cube"),
         )
         for axis in AXES
     ]
@@ -34,6 +37,7 @@ FORMATION = pa.schema(
         column("frame_id", pa.int32(), "active frame"),
         column("draws", pa.int64(), "steps on the frame since its formation is looked for", nullable=True),
         column("model", pa.string(), "none, blur, skew, both (blur and skew) or defocus"),
+        column("order", pa.int32(), "of the path in time: 1 straight, 2 quadratic, 3 cubic", nullable=True),
         column("blur_px", pa.float64(), "mean length of the pixels' ways while they were exposed, px"),
         column(
             "skew_px", pa.float64(), "mean length of their ways from the first to the last row's exposure, px"
@@ -54,6 +58,8 @@ FORMATION = pa.schema(
         *_twist("pose"),
         *_twist("blur"),
         *_twist("skew"),
+        *_twist("bend"),
+        *_twist("cube"),
         column(
             "disc_px", pa.float64(), "radius of the disc of defocus per unit of nearness beyond the focus, px"
         ),

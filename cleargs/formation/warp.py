@@ -16,7 +16,7 @@ from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels import warp_layout as layout
-from cleargs.splat.kernels.warp_layout import DisplacementFields
+from cleargs.splat.kernels.warp_layout import CUBE_REACH, DisplacementFields
 from cleargs.types import ArrayF32
 
 SAMPLES_PER_PIXEL = 1.0
@@ -28,6 +28,9 @@ MIN_SAMPLES, MAX_SAMPLES = 3, 64
 MIN_DIVIDED = 8
 """Number of samples from which a blur is taken in two passes. Scenes end alike, and a step with a blur of
 30 px costs four fifths as much (docs/experiments/formation.md)."""
+MAX_BOW = 0.5
+"""Largest distance, px, of a part of a curved path from the mean path of all parts that replaces it in the
+second pass."""
 STEPS_APART = 4
 """Samples of neighbouring times write to the same pixels in the transpose. One that follows at once waits for
 the other; four steps later it does not: along a row that takes half of the transpose's time, down a column
@@ -35,6 +38,9 @@ as much as before."""
 
 STRIDE = 8
 """Rows and columns from one pixel to the next whose displacements set the number of samples."""
+
+SPEEDS = 8
+"""Times at which the speed on a curved path is taken to measure its length."""
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PLASTIC = 0.7548776662466927
@@ -46,12 +52,22 @@ def enough_samples(fields: DisplacementFields) -> tuple[int, int]:
 
     A number is 1 where the frame has no such blur, and at most `MAX_SAMPLES`.
     """
-    sweeps = np.hypot(*fields.sweep[:, ::STRIDE, ::STRIDE].cpu().numpy())
-    longest = float(np.quantile(sweeps, 0.95))
+    longest = float(np.quantile(path_lengths(fields, STRIDE), 0.95))
     widest = float(np.quantile(fields.radius[::STRIDE, ::STRIDE].cpu().numpy(), 0.95))
     times = SAMPLES_PER_PIXEL * longest if longest > 0.05 else 1
     points = SAMPLES_PER_DISC_PIXEL * math.pi * widest**2 if widest > 0.05 else 1
     return _within(times), _within(points)
+
+
+def path_lengths(fields: DisplacementFields, stride: int = 1) -> ArrayF32:
+    """Return the lengths of the paths of every ``stride``-th pixel during the exposure, px, [h, w]."""
+    sweep = fields.sweep[:, ::stride, ::stride].cpu().numpy()
+    if fields.curve is None:
+        return np.asarray(np.hypot(*sweep))
+    bend, cube = np.split(fields.curve[:, ::stride, ::stride].cpu().numpy(), 2)
+    times = (np.arange(SPEEDS, dtype=np.float32) + np.float32(0.5)) / np.float32(SPEEDS) - np.float32(0.5)
+    speeds = [np.hypot(*(sweep + 2 * t * bend + (3 * t * t - np.float32(0.15)) * cube)) for t in times]
+    return np.asarray(np.sum(speeds, axis=0, dtype=np.float32) / np.float32(SPEEDS))
 
 
 def _within(count: float) -> int:
@@ -119,8 +135,10 @@ class Warp:
         times, points = enough_samples(fields)
         if points > 1 or times < MIN_DIVIDED:
             return cls(fields, margin, torch.from_numpy(samples(max(times, points))).to(device))
-        fine = round(math.sqrt(times))
-        coarse = math.ceil(times / fine)
+        coarse = max(math.ceil(times / round(math.sqrt(times))), _straight_parts(fields))
+        fine = max(1, math.ceil(times / coarse))
+        if coarse + fine >= times:
+            return cls(fields, margin, torch.from_numpy(samples(times)).to(device))
         between = cls(_shortened(fields, coarse), 0, torch.from_numpy(samples(fine)).to(device))
         return cls(fields, margin, torch.from_numpy(samples(coarse)).to(device), between)
 
@@ -135,9 +153,20 @@ class Warp:
         return backend_for(light.device).expose_backward(seen, self.fields, self.samples, margin=self.margin)
 
 
+def _straight_parts(fields: DisplacementFields) -> int:
+    """Return the number of equal parts of the exposure whose paths differ by `MAX_BOW` at most."""
+    if fields.curve is None:
+        return 1
+    bend, cube = np.split(fields.curve[:, ::STRIDE, ::STRIDE].cpu().numpy(), 2)
+    # The velocity at time t minus the mean one is 2t bend + (3t^2 - 1/4) cube; it is largest at the ends.
+    apart = float(np.quantile(np.hypot(*bend) + 0.5 * np.hypot(*cube), 0.95))
+    return math.ceil(0.5 * apart / MAX_BOW)
+
+
 def _shortened(fields: DisplacementFields, parts: int) -> DisplacementFields:
-    """Return the blur of one of ``parts`` equal parts of the exposure, without offset and defocus."""
-    sweep = fields.sweep / parts
+    """Return the mean blur of ``parts`` equal parts of the exposure, without offset and defocus."""
+    whole = fields.sweep if fields.curve is None else fields.sweep + 2.0 * CUBE_REACH * fields.curve[2:]
+    sweep = whole / parts
     reach = None if fields.reach is None else 0.5 * float(sweep[1].abs().max())
     return DisplacementFields(torch.zeros_like(sweep), sweep, torch.zeros_like(fields.radius), reach)
 

@@ -48,15 +48,10 @@ def write_video(
     *,
     codec: Codec = "h264",
 ) -> None:
-    """Write ``frames`` as an MP4: 4:2:0, BT.709, limited range.
+    """Write ``frames`` (at least one, read one by one) as an MP4: 4:2:0, BT.709, limited range.
 
-    Args:
-        path: the video.
-        frames: sRGB images, at least one, read one by one.
-        fps: frames per second.
-        bits_per_pixel: bits per pixel, kept over each second, in H.264 by one thread, so that equal frames
-            give equal bytes. None: no visible loss.
-        codec: the codec.
+    ``bits_per_pixel`` is kept over each second by one thread, so that equal frames give equal bytes. None: no
+    visible loss.
 
     Raises:
         InputError: an odd size, or this PyAV has no such encoder.

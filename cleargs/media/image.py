@@ -1,104 +1,57 @@
-"""Still images as RGB arrays, through OpenCV."""
+"""Still images as 8-bit sRGB arrays, through Pillow; JPEG XL through OpenImageIO."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
+from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
-from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from cleargs.media import MAX_PIXELS
-from cleargs.media.photos import (
-    decode_photo,
-    open_photo,
-    photo_format,
-    photo_orientation,
-    srgb_from_profile,
-)
-from cleargs.safe_io import cause, open_regular, read_bytes
+from cleargs.safe_io import FAULTS, cause, open_regular
 from cleargs.types import AnyImage, ImageU8, MaskU8
 
-_FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp", "jpegxl"})
-"""Formats that are read, as OpenImageIO names them."""
+_FORMATS = ["JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF"]
+"""Formats that are read, as Pillow names them."""
 
-_PHOTOS = frozenset({"heic", "avif"})
-"""Formats that Pillow reads."""
+_HEIC = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
+"""Brands of HEIC files (ISO/IEC 23008-12)."""
+
+_JXL = (b"\xff\x0a", b"\0\0\0\x0cJXL ")
+"""First bytes of JPEG XL files (ISO/IEC 18181-2)."""
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
 _METADATA = 2**18
 """Bytes at the start of a file in which its metadata are."""
 
+_ORIENTATION, _MODEL, _EXIF = 274, 272, 0x8769
+_LENS = (42036, 37386, 41989)
+"""Numbers of EXIF: orientation, camera, its further entries; of these the lens and its focal lengths."""
+
+_FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, Image.DecompressionBombError)
+"""Errors that Pillow raises for a file of the wrong form."""
+
 _HINT = "copy the file again, convert it to JPEG or PNG, or remove it"
-
-_MIRRORED = {
-    1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)
-}  # fmt: skip
-"""EXIF's orientation -> steps through rows and columns of the stored image."""
-
-
-class Header(NamedTuple):
-    """Values in the header of an image file, from which the cost of decoding is known before."""
-
-    width: int
-    height: int
-    orientation: int
-    """EXIF's orientation, 1 to 8; 1 if there is none."""
-    format: str
-    profile: bytes = b""
-    """The embedded ICC profile; empty if there is none."""
-
-
-def read_header(path: Path) -> Header:
-    """Return the header of the image in ``path``. Raises InputError if there is no image."""
-    from OpenImageIO import ImageInput, geterror
-
-    try:
-        with open_regular(path) as file:
-            head = file.read(12)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
-    if kind := photo_format(head):
-        with open_photo(path, kind) as photo:
-            profile = photo.info.get("icc_profile") or b""
-            return Header(*photo.size, photo_orientation(photo), kind, profile)
-    source = ImageInput.open(str(path))
-    if source is None:
-        geterror()  # else OpenImageIO prints it on stderr at the end
-    elif source.format_name() in _FORMATS:
-        spec = source.spec()
-        noted = spec.get_int_attribute("Orientation", 1)
-        profile = spec.getattribute("ICCProfile")
-        return Header(
-            spec.width,
-            spec.height,
-            noted if 1 <= noted <= 8 else 1,
-            source.format_name(),
-            b"" if profile is None else bytes(profile),
-        )
-    fault = "is empty (zero bytes)" if not head else "is not an image that can be read"
-    raise InputError(f"{path} {fault}", hint=_HINT)
 
 
 def lens_name(path: Path) -> tuple[str, ...]:
     """Return camera, lens and focal lengths by the EXIF of the image in ``path``.
 
-    Phones have several lenses whose images are of one size.
+    Phones have several lenses whose images are of one size. Empty if the file cannot be read.
     """
-    from OpenImageIO import ImageInput, geterror
-
-    source = ImageInput.open(str(path))
-    if source is None:
-        geterror()
-        return ()
-    names = ("Model", "Exif:LensModel", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm")
-    values = (source.spec().getattribute(name) for name in names)
-    return tuple(f"{value:.1f}" if isinstance(value, float) else str(value) for value in values)
+    with suppress(InputError), _opened(path) as image:
+        exif = image.getexif()
+        more = exif.get_ifd(_EXIF)
+        return tuple(str(value) for value in (exif.get(_MODEL), *map(more.get, _LENS)))
+    return ()
 
 
 def is_panorama(path: Path) -> bool:
@@ -108,9 +61,15 @@ def is_panorama(path: Path) -> bool:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height of the stored image in ``path``. Raises InputError like `read_header`."""
-    header = read_header(path)
-    return header.width, header.height
+    """Return width and height of the image in ``path`` as it is stored.
+
+    Raises:
+        InputError: there is no readable image.
+    """
+    with _opened(path) as image:
+        width, height = image.size
+        swapped = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) >= 5
+        return (height, width) if swapped else (width, height)
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
@@ -123,10 +82,12 @@ def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
         upright: turn it by its EXIF orientation.
 
     Raises:
-        InputError: there is no readable image.
+        InputError: there is no readable image, or it has more than `MAX_PIXELS`.
     """
-    bgr = _decode(path, cv2.IMREAD_COLOR, upright=upright)
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    with _decoded(path, upright=upright) as image:
+        rgb = (_grey(image) if image.mode.startswith("I;16") else image).convert("RGB")
+        profile = image.info.get("icc_profile")
+        return np.array(_srgb_from_profile(rgb, profile) if profile else rgb)
 
 
 def read_mask(path: Path) -> MaskU8:  # [H, W]
@@ -134,7 +95,8 @@ def read_mask(path: Path) -> MaskU8:  # [H, W]
 
     The threshold is 127, or 0 for masks of 0 and 1, which some programs write.
     """
-    grey = _decode(path, cv2.IMREAD_GRAYSCALE)
+    with _decoded(path) as image:
+        grey = np.asarray(_grey(image))
     border = 127 if grey.max() > 1 else 0
     return np.asarray(np.where(grey > border, 255, 0), np.uint8)
 
@@ -146,10 +108,10 @@ def read_alpha(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
     """
     if path.suffix.lower() in _OPAQUE:
         return None
-    image = _decode(path, cv2.IMREAD_UNCHANGED, upright=upright)
-    if image.ndim != 3 or image.shape[2] != 4:
-        return None
-    opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
+    with _decoded(path, upright=upright) as image:
+        if not image.has_transparency_data:
+            return None
+        opaque = np.asarray(image.convert("RGBA"))[..., 3] > 127
     return None if opaque.all() else np.asarray(np.where(opaque, 255, 0), np.uint8)
 
 
@@ -181,67 +143,99 @@ def to_uint8(image: AnyImage) -> ImageU8:
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
-def _decode(path: Path, flags: int, *, upright: bool = True) -> AnyImage:
-    """Return the image [H, W, ...], turned by its EXIF orientation (``upright``) or as it is stored.
-
-    It is decoded from memory, because OpenCV's file reader explains a failure only on stderr.
-    """
-    header = read_header(path)
-    if header.width * header.height > MAX_PIXELS:
-        raise InputError(
-            f"{path} has {header.width}x{header.height} pixels; at most {MAX_PIXELS} are read",
-            hint="reduce the image: no more than ingest.max_size of its long side is used anyway",
-        )
-    image = _stored(path, header, flags)
-    if header.profile and flags == cv2.IMREAD_COLOR:
-        rgb = np.ascontiguousarray(image[..., ::-1])
-        image = srgb_from_profile(rgb, header.profile)[..., ::-1]
-    # The image is as it is stored, except a TIFF, which OpenCV always turns.
-    turn = header.orientation
-    if header.format == "tiff":
-        turn = 1 if upright else {6: 8, 8: 6}.get(turn, turn)  # the others undo themselves
-    elif not upright:
-        turn = 1
-    if turn >= 5:  # mirrored at the diagonal, then as the first four
-        image = image.swapaxes(0, 1)
-    down, across = _MIRRORED[turn]
-    return np.ascontiguousarray(image[::down, ::across])
-
-
-def _stored(path: Path, header: Header, flags: int) -> AnyImage:
-    """Return the image as it is stored, in OpenCV's order of channels, as its ``flags`` ask for it."""
-    if header.format in _PHOTOS:
-        with open_photo(path, header.format) as photo:
-            return _as_flags_ask(decode_photo(path, photo), flags)
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """Open the image in ``path`` without decoding it. Errors of the block become an InputError."""
     try:
-        content = read_bytes(path)
+        with open_regular(path) as file:
+            head = file.read(12)
+            file.seek(0)
     except OSError as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
-    image: AnyImage | None = None
-    if header.format == "jpegxl":
-        from OpenImageIO import ImageInput, geterror
+    if not head:
+        raise InputError(f"{path} is empty (zero bytes)", hint=_HINT)
+    heic = head[4:8] == b"ftyp" and head[8:12] in _HEIC
+    if heic:
+        _register_heic(path)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # about metadata that is damaged
+            if head.startswith(_JXL):
+                yield _jpeg_xl(path)
+                return
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # ours is checked before decoding
+            try:
+                opened = Image.open(path, formats=["HEIF"] if heic else _FORMATS)
+            finally:
+                Image.MAX_IMAGE_PIXELS = limit
+            with opened:
+                yield opened
+    except _FAULTS as error:
+        reason = "" if isinstance(error, UnidentifiedImageError) else f": {cause(error)}"
+        raise InputError(f"{path} is not an image that can be read{reason}", hint=_HINT) from error
 
-        source = ImageInput.open(str(path))
-        pixels = None if source is None else source.read_image("uint8")
-        if pixels is not None and pixels.ndim == 3:
-            image = _as_flags_ask(pixels if pixels.shape[2] > 2 else pixels[..., [0, 0, 0]], flags)
-        geterror()  # else OpenImageIO prints it on stderr at the end
-    # libpng would report a truncated file on stderr.
-    elif header.format != "png" or b"IEND" in content:
-        with suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path} is not an image that can be read", hint=_HINT)
+
+@contextmanager
+def _decoded(path: Path, *, upright: bool = True) -> Iterator[Image.Image]:
+    """Open the image in ``path``, turned by its EXIF orientation (``upright``) or as it is stored."""
+    with _opened(path) as image:
+        width, height = image.size
+        if width * height > MAX_PIXELS:
+            raise InputError(
+                f"{path} has {width}x{height} pixels; at most {MAX_PIXELS} are read",
+                hint="reduce the image: no more than ingest.max_size of its long side is used anyway",
+            )
+        if not upright:
+            image.getexif()[_ORIENTATION] = 1
+        yield ImageOps.exif_transpose(image)
+
+
+def _jpeg_xl(path: Path) -> Image.Image:
+    from OpenImageIO import ImageInput, geterror
+
+    source = ImageInput.open(str(path))
+    if source is None:
+        raise ValueError(geterror())  # read here, else OpenImageIO prints it on stderr at the end
+    spec = source.spec()
+    pixels = source.read_image("uint8") if spec.width * spec.height <= MAX_PIXELS else None
+    geterror()
+    if pixels is None or pixels.ndim != 3:
+        raise ValueError("it is damaged, or too large")
+    image = Image.fromarray(pixels if pixels.shape[2] > 2 else pixels[..., 0])
+    image.getexif()[_ORIENTATION] = spec.get_int_attribute("Orientation", 1)
+    profile = spec.getattribute("ICCProfile")
+    if profile is not None:
+        image.info["icc_profile"] = bytes(profile)
     return image
 
 
-def _as_flags_ask(pixels: ImageU8, flags: int) -> ImageU8:  # [H, W, 3 or 4] RGB(A)
-    """Return ``pixels`` as OpenCV's flags of `imdecode` ask for them."""
-    alpha = pixels.shape[2] == 4
-    if flags == cv2.IMREAD_UNCHANGED:
-        code = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR
-    elif flags == cv2.IMREAD_GRAYSCALE:
-        code = cv2.COLOR_RGBA2GRAY if alpha else cv2.COLOR_RGB2GRAY
-    else:
-        code = cv2.COLOR_RGBA2BGR if alpha else cv2.COLOR_RGB2BGR
-    return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+def _register_heic(path: Path) -> None:
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise InputError(
+            f"{path} is a HEIC image, which needs the package pillow-heif",
+            hint="pip install 'cleargs[heif]', or convert the images to JPEG",
+        ) from error
+    pillow_heif.register_heif_opener()
+
+
+def _grey(image: Image.Image) -> Image.Image:
+    """Return the image in 8 bits of grey; Pillow would clip 16 of them."""
+    if image.mode.startswith("I;16"):
+        return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    return image.convert("L")
+
+
+def _srgb_from_profile(rgb: Image.Image, profile: bytes) -> Image.Image:
+    """Return ``rgb`` converted from its ICC ``profile`` to sRGB, relative colorimetric.
+
+    It stays as it is if the profile is sRGB's, is not one of RGB, or is damaged.
+    """
+    with suppress(ImageCms.PyCMSError, *_FAULTS):
+        source = ImageCms.getOpenProfile(io.BytesIO(profile))
+        if "srgb" in ImageCms.getProfileDescription(source).lower():
+            return rgb
+        if source.profile.xcolor_space.strip() == "RGB":
+            srgb, how = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
+            return ImageCms.profileToProfile(rgb, source, srgb, renderingIntent=how) or rgb
+    return rgb

@@ -43,11 +43,11 @@ def stage_key_config(stage: Stage, name: str, sections: Mapping[str, BaseModel])
     return {**key_config(sections[name]), **inherited}
 
 
-def library_versions(stage: Stage, device: Device) -> dict[str, str]:
+def library_versions(stage: Stage, device: Device, config: BaseModel) -> dict[str, str]:
     """Return name -> installed version of the libraries that affect results of ``stage`` on ``device``."""
     versions = {name: installed_version(name) for name in stage.LIBRARIES}
     other = getattr(stage, "other_libraries", None)
-    return versions if other is None else versions | other(device)
+    return versions if other is None else versions | other(device, config)
 
 
 def plugin_versions(config: BaseModel) -> dict[str, str]:

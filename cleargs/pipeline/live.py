@@ -17,7 +17,7 @@ from cleargs.base_model import FrozenModel
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.pipeline.store import writer_is_alive
-from cleargs.progress import COMPILING, PREVIEW, CountedTask, Reporter, Show, Task
+from cleargs.progress import COMPILING, PREVIEW, ForwardingTask, Reporter, Task
 from cleargs.safe_io import FAULTS, read_json
 
 PROGRESS_FILE = ".at_work.json"
@@ -109,7 +109,7 @@ class RecordingReporter:
 
         begun = time.monotonic()
         with self._reporter.task(label, total) as task:
-            yield _RecordingTask(task, total, show)
+            yield ForwardingTask(task, total, show)
         if label == COMPILING:
             self.compile_seconds += time.monotonic() - begun
 
@@ -117,15 +117,3 @@ class RecordingReporter:
         self._written = time.monotonic()
         with suppress(StoreError):
             write_json(self._path, state.model_dump())
-
-
-class _RecordingTask(CountedTask):
-    """A task that forwards to another one and writes the progress file."""
-
-    def __init__(self, task: Task, total: int | None, show: Show) -> None:
-        super().__init__(total, show)
-        self._task = task
-
-    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
-        self._task.update(done=done, note=note, share=share)
-        super().update(done=done, note=note, share=share)

@@ -5,7 +5,6 @@ They avoid double work. Correctness does not depend on them: it comes from the r
 
 from __future__ import annotations
 
-import fcntl
 import os
 import socket
 from collections.abc import Iterator
@@ -28,13 +27,12 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
     Yields:
         True with the lock, False without it, None on a file system without locks.
     """
-    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     while True:
         with disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
-            held = _acquire(handle, kind if wait else kind | fcntl.LOCK_NB)
+            held = _acquire(handle, shared=shared, wait=wait)
             present = None
             with suppress(FileNotFoundError):
                 present = path.stat().st_ino
@@ -79,14 +77,19 @@ def is_locked(path: Path) -> bool:
     except OSError:
         return False
     try:
-        return _acquire(handle, fcntl.LOCK_SH | fcntl.LOCK_NB) is not True
+        return _acquire(handle, shared=True, wait=False) is not True
     finally:
         os.close(handle)
 
 
-def _acquire(handle: int, kind: int) -> bool | None:
+def _acquire(handle: int, *, shared: bool, wait: bool) -> bool | None:
     try:
-        fcntl.flock(handle, kind)
+        import fcntl
+    except ImportError:  # a Python without it: as on a file system without locks
+        return None
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    try:
+        fcntl.flock(handle, kind if wait else kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:

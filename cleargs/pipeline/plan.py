@@ -110,7 +110,7 @@ class Planner:
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
             device=self.run.device_of(name),
-            libraries=library_versions(stage, self.run.device_of(name)) | plugin_versions(config),
+            libraries=library_versions(stage, self.run.device_of(name), config) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited: dict[str, None] = {}  # an ordered set
@@ -307,15 +307,14 @@ def rerun_lines(plans: list[StagePlan]) -> list[str]:
 
 
 def cost_line(plans: list[StagePlan]) -> str:
-    """Return one line with the expected time, memory and disk of each stage that has work to do."""
+    """Return one line with the expected time, memory and disk, and the time of each stage with work to do."""
     costs = [(plan.stage, plan.estimate) for plan in plans if plan.estimate is not None]
     if not costs:
         return ""
-    words = [
-        f"{stage} {_time(cost.minutes)}, {cost.memory_gb:.1f} GB memory, {_size(cost.disk_gb)} disk"
-        for stage, cost in costs
-    ]
-    return f"estimate: about {_time(sum(cost.minutes for _, cost in costs))} ({'; '.join(words)})"
+    whole = _time(sum(cost.minutes for _, cost in costs))
+    stages = ", ".join(f"{stage} {_time(cost.minutes)}" for stage, cost in costs)
+    memory, disk = max(cost.memory_gb for _, cost in costs), sum(cost.disk_gb for _, cost in costs)
+    return f"estimate: about {whole}, {memory:.1f} GB memory, {_size(disk)} disk ({stages})"
 
 
 def check_disk(plans: list[StagePlan], store: Path) -> None:

@@ -17,12 +17,15 @@ from cleargs.pipeline.store import STORE_FOLDER
 
 RUN_FILE = "run.toml"
 
+SCENE = "scene.ply"
+"""File of the scene in the results of a stage that trains, and link to the last of them in the run folder."""
+
 LOCK = ".lock"
 """Lock file of the process that works in the run folder."""
 
 HEADER = """\
 # The full configuration of this run. All commands on the run read it. `cleargs run` keeps these settings
-# until you change them: --set and --workflow give others, --reset starts from the recipe.
+# until you change them: --set and --recipe give others, --reset starts from the recipe.
 """
 
 WIDTH = 110

@@ -15,6 +15,7 @@ from typing import Literal
 
 from cleargs.digest import file_digest, tree_digest
 from cleargs.errors import CleargsError, InputError, StageError, StoreError
+from cleargs.files import disk_errors
 from cleargs.manifest import (
     FileRecord,
     Manifest,
@@ -37,7 +38,7 @@ from cleargs.pipeline.plan import (
     cost_line,
     rerun_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, read_source, write_run_file
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, read_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
 
@@ -118,6 +119,17 @@ class Runner:
         """Remove the links to results of other settings or inputs."""
         for name in self.planner.outdated():
             self.store.unlink(self.run.folder, name)
+        self._link_scene()
+
+    def _link_scene(self) -> None:
+        """Let ``RUN/scene.ply`` point to the scene of the last stage that has one; remove it if none has."""
+        folder, link = self.run.folder, self.run.folder / SCENE
+        targets = [Path(name, SCENE) for name in self.dag.names if (folder / name / SCENE).is_file()]
+        with disk_errors(link):
+            if link.is_symlink() and link.readlink() not in targets[-1:]:
+                link.unlink()
+            if targets and not link.is_symlink() and not link.exists():
+                link.symlink_to(targets[-1])
 
     def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
         """Report the cost of the remaining stages again: it is better known once the capture is read."""
@@ -128,38 +140,6 @@ class Runner:
         ]
         if line := cost_line(costs):
             self.reporter.info(f"new {line}")
-
-    def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> StageOutcome:
-        """Find or make the results of one stage, from the results of its upstream stages.
-
-        Raises StageError if an upstream stage is not done, or done only in part without ``allow_partial``.
-        """
-        check_address_space()
-        done: dict[str, Manifest] = {}
-        with self._lock_run(), self.store.in_use():
-            self.store.add_root(self.run.folder)
-            self._unlink_outdated()
-            for upstream in self.dag.until(name)[:-1]:
-                done[upstream] = self._finished(upstream, done, name, allow_partial=allow_partial)
-            outcome = self._find_or_make(name, done, forced=force)
-            self._unlink_outdated()
-        return outcome
-
-    def _finished(
-        self, upstream: str, done: Mapping[str, Manifest], name: str, *, allow_partial: bool
-    ) -> Manifest:
-        entry = self._find(upstream, self.planner.stage_key(upstream, done))
-        if entry is None or entry.manifest is None:
-            raise StageError(
-                f"{name} needs {upstream}, which is not done",
-                hint=f"run first: cleargs stage {upstream} {self.run.folder}",
-            )
-        if entry.manifest.status == "partial" and not allow_partial:
-            raise StageError(
-                f"{name} needs {upstream}, which is done only in part",
-                hint=f"run it again: cleargs stage {upstream} {self.run.folder}; or give --allow-partial",
-            )
-        return entry.manifest
 
     def _find(self, name: str, stage_key: StageKey) -> Entry | None:
         """Return the results for ``stage_key``. Damaged ones cause a warning and count as missing."""
@@ -220,6 +200,7 @@ class Runner:
                     manifest, how = self._make(stage_key, entry, forced=forced, locked=locked), "made"
         manifest = self._with_inherited(manifest, stage_key.inherited)
         self.store.link(self.run.folder, name, stage_key.key)
+        self._link_scene()
         return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.key))
 
     def _rehashed_key(self, name: str, done: Mapping[str, Manifest]) -> StageKey:

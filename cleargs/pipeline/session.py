@@ -85,12 +85,25 @@ def opened_store(root: Path) -> Iterator[Store]:
         yield Store(root, memo)
 
 
+def default_folder(source: Path) -> Path:
+    """Return the run folder of a capture for which none is given: next to it, and never the capture.
+
+    It is ``walk`` for ``walk.mp4``, and ``walk-scene`` for a folder ``walk`` or if ``walk`` is something else
+    than a run.
+    """
+    path = source if source.name not in ("", "..") else source.resolve()
+    folder = path.with_suffix("") if path.is_file() else path
+    if folder.exists() and not (folder / RUN_FILE).is_file():
+        folder = folder.with_name(f"{folder.name}-scene")
+    return folder
+
+
 def resolve_run(
     dag: Dag,
     source: Path,
     folder: Path,
     *,
-    workflow: str | None = None,
+    recipe: str | None = None,
     overrides: Sequence[str] = (),
     seed: int | None = None,
     reset: bool = False,
@@ -107,7 +120,7 @@ def resolve_run(
         dag: The stages, whose models check the settings.
         source: The capture.
         folder: The run folder, which need not exist.
-        workflow: Recipe to start from instead of the settings of an existing run.
+        recipe: Recipe to start from instead of the settings of an existing run.
         overrides: Settings as ``a.b=value``.
         seed: Seed instead of that of the recipe or the run.
         reset: Start from the recipe instead of the settings of an existing run.
@@ -128,7 +141,7 @@ def resolve_run(
             f"{source} is a run, not a capture",
             hint=f"give the capture of this run{f': {made_from}' if made_from else ''}",
         )
-    folder, forgets = folder.absolute(), reset or workflow is not None
+    folder, forgets = folder.absolute(), reset or recipe is not None
     metadata, kept = RunMetadata(), None
     try:
         metadata = read_metadata(folder)
@@ -141,7 +154,7 @@ def resolve_run(
             raise ConfigError(
                 f"the settings of {folder} cannot be used: {error}", hint="start from the recipe with --reset"
             ) from error
-    config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
+    config = load_config(dag, recipe or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
     keeps = device == "auto" and metadata.device is not None
     chosen = resolve_device(device, say, kept=metadata.device, test=test_gpu)

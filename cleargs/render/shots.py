@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,10 +16,13 @@ from cleargs.errors import InputError
 from cleargs.formation.frames import view_of
 from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
-from cleargs.render.output import Shot
+from cleargs.media.encode import Codec
+from cleargs.progress import Reporter
+from cleargs.render.output import Shot, kind_of, require_free, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.safe_io import FAULTS, cause, read_json
 from cleargs.splat.camera import Camera
+from cleargs.splat.ply import read_ply
 
 World = Literal["normalised", "input"]
 
@@ -31,6 +34,87 @@ _NERFSTUDIO = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "c
 """Field of transforms.json -> field of a camera."""
 
 Size = tuple[int, int]
+
+SECONDS = 10.0
+"""Default length of a film."""
+
+
+@dataclass(frozen=True)
+class ShotOptions:
+    """The pictures to render. Without ``frame``, ``turntable`` and ``poses``, they follow the camera path."""
+
+    frame: int | None = None
+    """Render a still at the pose of this frame."""
+    turntable: bool = False
+    poses: Path | None = None
+    """Render a picture at each pose in this file."""
+    world: World | None = None
+    """World of `poses`."""
+    size: Size | None = None
+    """Width and height, px."""
+    fps: float = 30.0
+    seconds: float | None = None
+    side_by_side: bool = False
+    codec: Codec = "h264"
+
+    def check(self, output: Path) -> None:
+        """Raise InputError if the options contradict each other, or ``output``."""
+        ending, still, posed = output.suffix.lower(), self.frame is not None, self.poses is not None
+        for wrong, message, hint in (
+            (
+                still + self.turntable + posed > 1,
+                "two of --frame, --turntable, --poses",
+                "give one of them",
+            ),
+            (still and ending == ".mp4", "--frame is a still", "end --output with .png or .exr"),
+            (self.world and not posed, "--world needs --poses", "give --poses, or omit --world"),
+            (
+                self.seconds is not None and (posed or still),
+                "--seconds is the length of the path or the turntable",
+                "omit it; --fps sets the speed of --poses",
+            ),
+            (
+                self.side_by_side and (self.turntable or posed),
+                "--side-by-side needs frames of the capture",
+                "omit --turntable and --poses to follow the path, or give --frame",
+            ),
+            (self.side_by_side and ending == ".exr", "--side-by-side is for films and PNGs", "omit it"),
+        ):
+            if wrong:
+                raise InputError(message, hint=hint)
+
+
+def render_run(
+    scene: Path,
+    output: Path,
+    options: ShotOptions,
+    reporter: Reporter,
+    *,
+    force: bool = False,
+    device: str = "cpu",
+) -> list[Shot]:
+    """Render the scene file of a stage, in its run folder, to ``output``. Return the shots.
+
+    Raises:
+        InputError: an option cannot be used, or ``output`` exists and is not to be replaced.
+    """
+    options.check(output)
+    kind = kind_of(output)
+    require_free(output, force=force)
+    ingest = scene.parents[1] / "ingest"
+    capture = CaptureShots(ingest, options.size, even=kind == "film", side_by_side=options.side_by_side)
+    count = max(2, round(options.fps * (options.seconds or SECONDS)))
+    if options.poses is not None:
+        shots = capture.poses(options.poses, options.world)
+    elif options.turntable:
+        shots = capture.turntable(count)
+    elif options.frame is not None or kind == "still":
+        shots = capture.still(options.frame)
+    else:
+        shots = capture.path(count)
+    with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
+        write_shots(output, read_ply(scene), shots, task, fps=options.fps, codec=options.codec, device=device)
+    return shots
 
 
 class CaptureShots:

@@ -14,18 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame, load_frames
+from cleargs.evaluate.metrics import apply_affine, fit_affine
+from cleargs.evaluate.metrics import psnr as psnr_of
 from cleargs.formation.exposure import read_exposure
+from cleargs.formation.frame import from_row
 from cleargs.formation.frames import view_of
+from cleargs.formation.motion import pixel_paths
 from cleargs.formation.table import FORMATION
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.parquet import read_any_table, read_table
 from cleargs.rivr.distillation import TrainedScene
 from cleargs.rivr.tables import Selection, read_selection
-from cleargs.rva.tables import FRAMES
+from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
 from cleargs.splat.camera import Camera
 from cleargs.splat.render import Viewer
-from cleargs.types import ImageU8
+from cleargs.splat.tables import TRAIN
+from cleargs.types import ImageU8, MaskBool
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles, on the page, of frames that RVA does not rate."""
@@ -34,9 +39,23 @@ CHOICES = {
     "render": "the render",
     "restored": "the restored frame",
     "fused": "the fusion of render and restored frame",
-    "observed": "none: the raw frame is kept",
+    "observed": "kept as filmed",
 }
 """Candidate -> its description in the report."""
+
+EFFECTS = {
+    "blur": ("motion blur", "blur_px"),
+    "skew": ("rolling shutter", "skew_px"),
+    "both": ("motion blur and rolling shutter", "blur_px"),
+    "defocus": ("defocus", "defocus_px"),
+}
+"""Model of image formation -> its name, and the column of ``formation.parquet`` with its size."""
+
+MIN_FAULT = 0.2
+"""Smaller faults of a frame are not reported."""
+
+LAST_STEPS = 3
+"""Number of the last training steps on a frame whose PSNR is shown as that of the frame."""
 
 MEANINGS = {column.name: column.metadata[b"meaning"].decode() for column in FORMATION}
 """Column of ``formation.parquet`` -> its meaning."""
@@ -55,6 +74,11 @@ class FrameRow:
     """Transform of sRGB colours from the last scene to the frame; None without exposure compensation."""
     formation: Mapping[str, Any] = field(default_factory=dict)
     """Column of ``formation.parquet`` of the last scene -> value; empty without one."""
+    psnr: float | None = None
+    """Median PSNR, dB, of the last training steps on the raw frame, as its camera saw it; None if no training
+    used the frame."""
+    moving: MaskBool | None = None  # [rows, columns]
+    """Cells, which divide the frame evenly, that the training left out since something moves there."""
 
     @property
     def role(self) -> str:
@@ -65,8 +89,24 @@ class FrameRow:
 
     @property
     def weight(self) -> float | None:
-        """Weight of the raw frame in training, from 0 to 1."""
-        return self.judged.get("weight")
+        """Weight with which the raw frame taught at the end, from 0 to 1; None if it is unknown."""
+        weight: float | None = self.formation.get("weight_after", self.judged.get("weight"))
+        return weight
+
+    @property
+    def teaching(self) -> str:
+        """The weight of the raw frame in words, with its reason; "" if it is unknown."""
+        if self.role in (UNPLACED, HELD_OUT):
+            return f"{self.role}: not used"
+        if self.weight is None:
+            return ""
+        counts = "counts fully" if self.weight > 0.995 else f"counts {100 * self.weight:.0f} %"
+        counts = counts if self.weight else "not used"
+        if self.modelled:
+            effect, size = EFFECTS[self.formation["model"]]
+            return f"{effect} {self.formation[size]:.1f} px, simulated: {counts}"
+        fault = worst_cue(self.judged)
+        return f"{fault}: {counts}" if fault and self.weight < 0.995 else counts
 
     @property
     def selection(self) -> Selection | None:
@@ -75,11 +115,8 @@ class FrameRow:
 
     @property
     def chosen(self) -> str | None:
-        """Candidate of the latest round that the training uses; None if it was refused."""
-        if self.selection is None:
-            return None
-        used = self.selection.accepted or self.selection.chosen == "observed"
-        return self.selection.chosen if used else None
+        """Candidate of the latest round that repairs the frame; None if the frame is kept as filmed."""
+        return self.selection.chosen if self.selection is not None and self.selection.accepted else None
 
     @property
     def modelled(self) -> bool:
@@ -99,6 +136,24 @@ class FrameRow:
         """Return the fitted motion blur, or the rolling shutter between first and last line, in pixels."""
         found: float | None = self.formation.get(name, getattr(self.selection, name, None))
         return found
+
+
+def worst_cue(judged: Mapping[str, Any]) -> str:
+    """Return the largest fault of a row of ``rva/frames.parquet``, from 0 (good) to 1, as "blur 0.82".
+
+    A low quality counts as a fault too, as "low sharpness 0.94". "" if no fault reaches `MIN_FAULT`.
+    """
+    faults = faults_of(judged)
+    name = max(faults, key=lambda name: faults[name], default="")
+    return f"{name} {faults[name]:.2f}" if name and faults[name] >= MIN_FAULT else ""
+
+
+def faults_of(judged: Mapping[str, Any]) -> dict[str, float]:
+    """Return the cues of a row of ``rva/frames.parquet`` as faults, from 0 (good) to 1 (bad)."""
+    lacking = {f"low {name}": judged.get(f"r_{name}") for name in R_CUES}
+    harms = {name.replace("_", " "): judged.get(f"b_{name}") for name in B_CUES}
+    faults = {name: 1.0 - value for name, value in lacking.items() if value is not None}
+    return faults | {name: value for name, value in harms.items() if value is not None}
 
 
 def scene_with_models(rows: Sequence[FrameRow], run: Path, stages: Collection[str]) -> TrainedScene | None:
@@ -151,9 +206,16 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     if "rivr" in stages:
         for found in sorted(read_selection(run / "rivr" / "selection.parquet"), key=lambda row: row.round):
             rounds.setdefault(found.frame_id, []).append(found)
+    psnr = _last_psnr([run / stage / "train.parquet" for stage in SCENES if stage in stages])
     affines: dict[int, NDArray[np.float64]] = {}
     formation: dict[int, dict[str, Any]] = {}  # stays empty if image formation is off
+    moving: dict[int, MaskBool] = {}
     if final := last_scene(stages):
+        if (path := run / final / "movement.parquet").is_file():
+            for row in read_any_table(path).to_pylist():
+                shape = row["rows"], row["columns"]
+                bits = np.unpackbits(np.frombuffer(row["moves"], np.uint8), count=shape[0] * shape[1])
+                moving[row["frame_id"]] = bits.reshape(shape) > 0
         exposure = read_exposure(run / final / "exposure.parquet")
         if exposure.enabled:
             affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
@@ -166,9 +228,26 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
             tuple(rounds.get(frame.frame_id, ())),
             affines.get(frame.frame_id),
             formation.get(frame.frame_id, {}),
+            psnr.get(frame.frame_id),
+            moving.get(frame.frame_id),
         )
         for frame in load_frames(run / "ingest")
     ]
+
+
+def _last_psnr(tables: Sequence[Path]) -> dict[int, float]:
+    """Return frame_id -> median PSNR of the last `LAST_STEPS` steps on the raw frame at its full size."""
+    steps: dict[int, list[tuple[int, float]]] = {}
+    for table in (read_table(path, TRAIN) for path in tables if path.is_file()):
+        columns = (table[name].to_pylist() for name in ("frame_id", "kind", "width", "psnr"))
+        for frame_id, kind, width, psnr in zip(*columns, strict=True):
+            if kind == "real" and math.isfinite(psnr):
+                steps.setdefault(frame_id, []).append((width, psnr))
+    found = {}
+    for frame_id, of_frame in steps.items():
+        full = max(width for width, _ in of_frame)
+        found[frame_id] = float(np.median([psnr for width, psnr in of_frame if width == full][-LAST_STEPS:]))
+    return found
 
 
 def camera_of(frame: Frame) -> Camera:
@@ -181,11 +260,13 @@ def camera_of(frame: Frame) -> Camera:
 
 LAYERS = {
     "observed": "As filmed",
+    "paths": "Paths during the exposure",
     "explained": "Render with camera effects",
     "deblurred": "Deblurred",
     "restored": "Restored",
     "fused": "Fused",
     "render": "Scene before repair",
+    "moving": "Not used: moves",
     "final": "Final scene",
 }
 """Layer -> its label on the page, in the order of the page."""
@@ -197,6 +278,8 @@ IMAGE_BYTES = 8_500_000
 _BYTES_PER_PIXEL = 0.18  # in JPEG files at _QUALITY
 _SIDE_MAX, _SIDE_MIN = 960, 240  # limits of the long side of a layer, px
 _THUMBNAIL, _QUALITY = 240, 84  # long side, px; JPEG quality
+_DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # of a drawn path and its border
+_UNUSED = (214, 69, 48)  # colour of pixels that no training used, sRGB
 
 MAX_RENDERED = 40
 """Maximum number of frames, evenly along the trajectory, for which the final scene is rendered. It limits the
@@ -212,8 +295,14 @@ class ImageFile(NamedTuple):
     height: int
 
 
-FramePictures = tuple[ImageFile, dict[str, ImageFile]]
-"""Thumbnail of a frame, and its layers by their names in `LAYERS`."""
+class FramePictures(NamedTuple):
+    """The image files of a frame."""
+
+    thumbnail: ImageFile
+    layers: dict[str, ImageFile]
+    """Layer, by its name in `LAYERS` -> its file."""
+    psnr: float | None
+    """PSNR, dB, of the final scene against a frame that was held out; None for others."""
 
 
 def write_pictures(
@@ -240,6 +329,7 @@ def write_pictures(
     (report / FOLDER).mkdir(parents=True)
     placed = [row.frame.frame_id for row in rows if final and row.frame.registered]
     rendered = set(placed[:: -(-len(placed) // MAX_RENDERED) or 1])
+    rendered |= {row.frame.frame_id for row in rows if final and row.role == HELD_OUT}
     layers = sum(_expected_layers(row) for row in rows) + len(rendered)
     side = side_of(layers, rows[0].frame.height / rows[0].frame.width if rows else 1.0, IMAGE_BYTES)
     # Renders run one after the other, since each uses all threads. Files are read and written in parallel.
@@ -295,6 +385,11 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
         StoreError: if the file of the layers cannot be read.
     """
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
+    if row.moving is not None:
+        height, width = images["observed"].shape[:2]
+        cells = cv2.resize(row.moving.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        tint = np.where(cells[..., None] > 0, _UNUSED, images["observed"]).astype(np.uint8)
+        images["moving"] = np.asarray(cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0), np.uint8)
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}
@@ -304,8 +399,8 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
 def _expected_layers(row: FrameRow) -> int:
     """Return how many layers a frame has besides the final scene."""
     if row.selection is not None and row.selection.exr is not None:
-        return 5
-    return 3 if row.modelled else 1
+        return 6 if row.modelled else 5
+    return 4 if row.modelled else 1
 
 
 def _write_frame(
@@ -317,12 +412,41 @@ def _write_frame(
     side: int,
 ) -> FramePictures:
     images = {**layers_of(row, run), **formed}
+    if row.modelled:
+        images["paths"] = with_paths(images["observed"], row)
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
     names = [layer for layer in LAYERS if layer in images]
     layers = {layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side) for layer in names}
-    return write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers
+    unseen = _aligned_psnr(final, images["observed"]) if final is not None and row.role == HELD_OUT else None
+    return FramePictures(write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers, unseen)
+
+
+def _aligned_psnr(render: ImageU8, observed: ImageU8) -> float | None:
+    """Return the PSNR, dB, of a render against the raw frame, after the best affine change of its colours."""
+    height, width = render.shape[:2]
+    reference = np.asarray(cv2.resize(observed, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    image, target = render / 255.0, reference / 255.0
+    return psnr_of(to_uint8(apply_affine(image, fit_affine(image, target, None))), reference)
+
+
+def with_paths(image: ImageU8, row: FrameRow) -> ImageU8:
+    """Return an image of a frame with the paths of some of its pixels during the exposure, true to scale."""
+    camera = camera_of(row.frame)
+    motion = from_row({**row.formation, "frame_id": row.frame.frame_id}).motion
+    shape = (3, 4) if camera.width >= camera.height else (4, 3)
+    paths = pixel_paths(motion, camera, shape, np.linspace(-0.5, 0.5, 33))
+    rows, columns = np.indices(shape) + 0.5
+    centres = np.stack([columns / shape[1] * camera.width, rows / shape[0] * camera.height], -1)
+    lines = (paths + centres).reshape(len(paths), -1, 2).swapaxes(0, 1)
+    drawn, unit = image.copy(), max(1, round(max(camera.width, camera.height) / 480))
+    fixed = [np.rint(8 * line).astype(np.int32) for line in lines]  # in eighths of a pixel
+    for colour, width in ((_DARK, 3 * unit), (_LIGHT, unit)):
+        cv2.polylines(
+            drawn, fixed, isClosed=False, color=colour, thickness=width, lineType=cv2.LINE_AA, shift=3
+        )
+    return drawn
 
 
 def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:

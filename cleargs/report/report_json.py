@@ -13,6 +13,8 @@ from cleargs.manifest import Manifest, linked_manifest
 from cleargs.safe_io import read_json
 
 FOLDER, PAGE, REPORT_JSON = "report", "index.html", "report.json"
+ENTRY = "report.html"
+"""File in the run folder that leads to the report."""
 
 
 @dataclass(frozen=True)
@@ -62,5 +64,30 @@ def last_run(run: Path) -> LastRun | None:
 
 def write_report_json(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
     """Write ``report.json`` into the ``folder`` of a report."""
-    content = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
+    content = {
+        "made_from": _made_from(manifests),
+        "last_run": asdict(last) if last else None,
+        "cameras": cameras_of(manifests),
+    }
     write_json(folder / REPORT_JSON, content)
+
+
+def cameras_of(manifests: Mapping[str, Manifest]) -> dict[str, Any]:
+    """Return how the cameras were placed, by ingest's manifest; empty without one.
+
+    ``method`` is "given", "adjusted", "sfm over given" (SfM, laid over the given cameras) or "sfm".
+    ``off_px_before`` and ``off_px`` are the median errors (px) of matches that took no part, at the given
+    poses and those of the method; None if not measured. ``lenses`` has lens, focal length and frames of
+    each camera, ``placed`` the number of frames by the way in which they were placed.
+    """
+    if (ingest := manifests.get("ingest")) is None:
+        return {}
+    errors = ingest.summary.get("kept_out_matches_off_px") or {}
+    origin = {"input": "given", "refined": "adjusted"}.get(ingest.summary.get("poses", ""), "sfm")
+    return {
+        "method": "sfm over given" if origin == "sfm" and errors else origin,
+        "off_px_before": errors.get("given"),
+        "off_px": errors.get(origin),
+        "lenses": ingest.summary.get("cameras"),
+        "placed": ingest.summary.get("placed"),
+    }

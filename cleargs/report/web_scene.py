@@ -1,7 +1,7 @@
-"""The scenes of a report: compressed for the browser, with camera poses for the 3D viewers.
+"""The scene of a report: compressed for the browser, with camera poses for the 3D viewer.
 
 The viewer is PlayCanvas's SuperSplat Viewer. It rotates each PLY by 180 degrees about z, so that y points up.
-Poses are rotated too. Its cameras have no roll, so stills use `level_camera`.
+Poses are rotated too. Its cameras have no roll, so the page rotates them as those of the frames.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from cleargs.report.frames import FrameRow, camera_of
-from cleargs.splat.camera import Camera, look_at
+from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians
@@ -25,6 +26,9 @@ from cleargs.splat.scene import Scene
 
 SCENE_BYTES = 10_000_000
 """Maximum size of a scene with up to half a million Gaussians. SH degrees that do not fit are left out."""
+
+LICENCE = "viewer-LICENSE.txt"
+"""File with the viewer's licence, next to the page."""
 
 _VIEWER = Path(__file__).parent / "static" / "viewer"
 _ROTATION = np.array([-1.0, -1.0, 1.0])  # the diagonal of the rotation by 180 degrees about z
@@ -66,7 +70,7 @@ def write_scene(path: Path, name: str, scene: Scene) -> int:
 def write_viewer(folder: Path) -> str:
     """Write the vendored viewer as a script, with its licence, and return its name and version."""
     (folder / "viewer.js").write_bytes(_script("viewer", (_VIEWER / "index.js.gz").read_bytes()))
-    (folder / "viewer-LICENSE.txt").write_bytes((_VIEWER / "LICENSE").read_bytes())
+    (folder / LICENCE).write_bytes((_VIEWER / "LICENSE").read_bytes())
     return (_VIEWER / "VERSION").read_text(encoding="utf-8").strip()
 
 
@@ -85,19 +89,11 @@ def viewer_pose(camera: Camera) -> dict[str, Any]:
     }
 
 
-def level_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera of the viewer at `viewer_pose`: without roll, and with a centred optical axis.
-
-    Args:
-        camera: The camera of a frame.
-        width: Width of the viewer's canvas, in pixels.
-        height: Height of the viewer's canvas, in pixels.
-    """
-    target = camera.centre + camera.world_to_camera[2, :3]
-    pose = look_at(camera.centre, target, np.array([0.0, -1.0, 0.0]))
-    side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
-    focal *= max(width, height) / side
-    return Camera(width, height, focal, focal, width / 2, height / 2, pose)
+def viewer_rotation(camera: Camera) -> list[float]:
+    """Return the rotation of ``camera`` in the viewer's world as a quaternion x, y, z, w (OpenGL axes)."""
+    right, down, forward = camera.world_to_camera[:3, :3] * _ROTATION
+    quaternion: list[float] = Rotation.from_matrix(np.array([right, -down, -forward]).T).as_quat().tolist()
+    return quaternion
 
 
 def opening_frame(placed: Sequence[FrameRow]) -> FrameRow:
@@ -108,15 +104,15 @@ def opening_frame(placed: Sequence[FrameRow]) -> FrameRow:
 
 
 def viewer_data(
-    placed: Sequence[FrameRow], scenes: Sequence[Mapping[str, Any]]
+    placed: Sequence[FrameRow], scene: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[int, float]]:
-    """Return the settings of both viewers (schema of SuperSplat Viewer, version 2), and their scenes.
+    """Return the settings of the viewer (schema of SuperSplat Viewer, version 2).
 
     The trajectory is an animation track whose keys are the poses of the frames.
 
     Args:
         placed: The frames with a pose.
-        scenes: The data of both scenes for the page.
+        scene: The data of the scene for the page.
 
     Returns:
         The settings, and frame_id -> time in the animation, in seconds.
@@ -141,11 +137,12 @@ def viewer_data(
         },
     }
     data = {
-        "scenes": [{name: scene[name] for name in ("key", "antialias", "background")} for scene in scenes],
-        "start": times[start],
+        "antialias": scene["antialias"],
+        "step": _SECONDS_PER_FRAME,
+        "rotations": [viewer_rotation(camera_of(row.frame)) for row in placed],
         "settings": {
             **json.loads((_VIEWER / "settings.json").read_text(encoding="utf-8")),
-            "background": {"color": list(scenes[-1]["background"])},
+            "background": {"color": list(scene["background"])},
             "animTracks": [track],
             "cameras": [{"initial": poses[start]}],
             "annotations": [],

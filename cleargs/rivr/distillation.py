@@ -20,6 +20,7 @@ from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.deblur import deblur
 from cleargs.formation.exposure import apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, fit_motion
+from cleargs.formation.movement import read_movement, still_pixels, write_movement
 from cleargs.formation.observed import FormedView, evaluate_views, pooled_unseen, render_observed
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.models.scorer import Scorer
@@ -39,7 +40,7 @@ from cleargs.splat.views import TrainingView
 from cleargs.types import ImageF32, MaskBool
 
 SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
-EXPOSURE, FORMATION = "exposure.parquet", "formation.parquet"
+EXPOSURE, FORMATION, MOVEMENT = "exposure.parquet", "formation.parquet", "movement.parquet"
 REJECTED = "rejected.ply"
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -76,8 +77,8 @@ def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
 class TrainedScene:
     """A scene on disk, ready to be rendered.
 
-    ``folder`` has ``scene.ply``, ``exposure.parquet`` and ``formation.parquet``; StoreError is raised if one
-    is missing or damaged.
+    ``folder`` has ``scene.ply``, ``exposure.parquet``, ``formation.parquet`` and ``movement.parquet``;
+    StoreError is raised if one is missing or damaged.
     """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
@@ -88,6 +89,8 @@ class TrainedScene:
         self.exposure = self._written_exposure if self._written_exposure.enabled else None
         """The affines of the frames; None where compensation is off."""
         self.formations, self._weights = read_formation(folder / FORMATION)
+        self.moving = read_movement(folder / MOVEMENT)
+        """Cells that move, by frame_id."""
         self._engine = rasteriser_for(device)
 
     def render(self, view: TrainingView) -> ImageF32:
@@ -103,8 +106,17 @@ class TrainedScene:
     def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
         """Return the PSNR, dB, of the pixels of ``views`` that no training saw; None where there are none."""
         return pooled_unseen(
-            evaluate_views(self.scene, views, self.exposure, self.formations, engine=self._engine)
+            evaluate_views(
+                self.scene, views, self.exposure, self.formations, moving=self.moving, engine=self._engine
+            )
         )
+
+    def still(self, view: TrainingView, mask: MaskBool | None) -> MaskBool | None:
+        """Return the pixels of ``mask`` in which nothing moves; None: all."""
+        if view.frame_id not in self.moving:
+            return mask
+        pixels = still_pixels(self.moving[view.frame_id], view.camera.height, view.camera.width)
+        return pixels if mask is None else pixels & mask
 
     def explained(self, view: TrainingView) -> Explained | None:
         """Return a raw frame as the training explains it; None without a model of the frame."""
@@ -168,15 +180,23 @@ class TrainedScene:
     def _with_depth(self, camera: Camera) -> Render:
         return self._engine.view(self.scene, camera, depth=True)
 
-    def fidelity(self, holdout: Sequence[TrainingView], scorer: Scorer, threads: int) -> Fidelity | None:
+    def fidelity(
+        self,
+        holdout: Sequence[TrainingView],
+        scorer: Scorer,
+        threads: int,
+        before: TrainedScene | None = None,
+    ) -> Fidelity | None:
         """Return the agreement of the scene with the held-out frames; None without any.
 
+        Movement does not count: as found for this scene, or for that ``before``, which it is compared with.
         A frame is compared with the render with that frame's motion, since a sharp scene is not wrong because
         raw frames are blurred and skewed by the camera's motion.
         """
         values, scores = [], []
         for view in holdout:
             render, (observed, mask) = self.render(view), observation(view)
+            mask = (before or self).still(view, mask)
             counted = None if mask is None else torch.from_numpy(mask)
             values.append(psnr(self._render_observed(view), torch.from_numpy(observed), counted))
             scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))
@@ -223,6 +243,7 @@ class TrainedScene:
                 exposure=self.exposure,
                 lr_exposure=config.lr_exposure,
                 known=self.formations,
+                moving=self.moving,
             )
             even = sum(view.kind == "pseudo" for view in views) / len(views)
             share = even if pseudo_share == "even" else pseudo_share * repaired
@@ -243,6 +264,7 @@ class TrainedScene:
             write_exposure(folder / EXPOSURE, formation.exposure or self._written_exposure)
             weights = {view.frame_id: view.weight for view in views if view.kind == "real"}
             write_formation(folder / FORMATION, formation, weights)
+            write_movement(folder / MOVEMENT, formation.moving)
             write_ply(folder / SCENE, result.scene)  # last: it marks the training as done
         (folder / CHECKPOINT).unlink(missing_ok=True)
         return TrainedScene(folder, self._device)
@@ -262,7 +284,7 @@ def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected:
     """
     logs = [read_table(training / LOG, TRAIN) for training in trainings]
     write_table(out / LOG, pa.concat_tables(logs) if logs else TRAIN.empty_table(), TRAIN)
-    for name in (EXPOSURE, FORMATION, STATE, SCENE):
+    for name in (EXPOSURE, FORMATION, MOVEMENT, STATE, SCENE):
         _copy(scene.folder / name, out / name)
     if rejected is not None:
         _copy(rejected.folder / SCENE, out / REJECTED)

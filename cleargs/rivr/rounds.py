@@ -126,8 +126,8 @@ def run_round(
                 row, image = repair(number, view, exr, scene, rules)
                 write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
-            tally = ", ".join(f"{count} {name}" for name, count in chosen_counts(rows).items())
-            task.update(done=len(rows), note=tally)
+            kept = chosen_counts(rows)["observed"]
+            task.update(done=len(rows), note=f"{kept} kept as filmed, {len(rows) - kept} repaired")
     return rows
 
 
@@ -143,6 +143,7 @@ def repair(
     restored, source, deblurred = rules.restored(view, rendered, scene)
     explained = scene.explained(view)
     observed, mask = observation(view)
+    mask = scene.still(view, mask)  # regions that move are not repaired
     layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
     if rules.use_fused:
         fused = fuse(from_layer(layers["render"]), from_layer(layers["restored"]), rules.fuse_sigma)

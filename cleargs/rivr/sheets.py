@@ -18,7 +18,11 @@ SHEET_FRAMES = 6
 
 
 def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) -> None:
-    """Write one line per row: observation, the same without its motion, and candidates with their scores."""
+    """Write one line per row: the observation, the same without its motion, and its candidates.
+
+    Candidates have both scores, and a repair that was chosen is marked. A frame that is kept as filmed is
+    not: image formation simulates what its camera did.
+    """
     write_rgb(path, contact_sheet([_candidates(row, rivr) for row in rows] or [_nothing()]))
 
 
@@ -50,10 +54,10 @@ def write_before_after_sheet(
 
 def _candidates(row: Selection, rivr: Path) -> list[Tile]:
     layers = row.layers(rivr)
-    head = f"frame {row.frame_id}, round {row.round}: observed"
+    head = f"frame {row.frame_id}, round {row.round}: {'kept ' if row.chosen == 'observed' else ''}as filmed"
     if row.primary_observed is not None:
         head += f" {row.primary_observed:.1f} / {row.tiebreak_observed:.1f}"
-    tiles = [Tile(from_layer(layers["observed"]), head, marked=row.chosen == "observed")]
+    tiles = [Tile(from_layer(layers["observed"]), head)]
     if "deblurred" in layers:
         motion = f"undone: blur {row.blur_px:.1f} px, skew {row.skew_px:.1f} px"
         tiles.append(Tile(from_layer(layers["deblurred"]), motion))

@@ -256,6 +256,7 @@ def ghosting(m: Measures) -> ArrayF64:
     """Return b_ghosting (a double image of the whole frame): the cepstral side peak above the neighbours'.
 
     Failure modes: those of `measures.ghosting`; ghosts of single moving objects are missed.
+    `cleargs.rva.hidden` finds objects that hide the scene.
     """
     content = np.minimum(over_neighbours(m.ghosting, np.min), _GHOST_CONTENT)
     return ramp(m.ghosting - content, _GHOST)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from cleargs.base_model import Inherited, Settings
+from cleargs.base_model import Inherited, Settings, Unit
 
 # Numbers of steps and Gaussians if the settings leave them unset (measured in docs/experiments/training.md).
 # Steps follow the number of frames, so that each frame is seen often enough. Gaussians follow the number of
@@ -18,7 +18,7 @@ STEPS_PER_FRAME = 50
 MIN_STEPS, MAX_STEPS = 3200, 7200
 STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
 
-PIXELS_PER_GAUSSIAN = 160
+PIXELS_PER_GAUSSIAN = 80
 MIN_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
@@ -36,7 +36,7 @@ def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
 def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
     """Return the maximum number of Gaussians for a capture.
 
-    It is one Gaussian (59 numbers at SH degree 3) per 160 pixels (480 numbers, most seen by several frames),
+    It is one Gaussian (59 numbers at SH degree 3) per 80 pixels (240 numbers, most seen by several frames),
     times the factor of the quality. Fewer than 40,000 reduce the PSNR of small captures by 1 dB.
 
     Args:
@@ -62,14 +62,23 @@ class FormationConfig(Settings):
     every: int = Field(
         10, ge=1, description="training steps on a frame between two estimates of its image formation"
     )
-    pose: bool = Field(False, description="correct the pose of a frame together with its motion")
+    pose: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="correct the pose of a frame together with its motion; auto = where ingest found or "
+        "adjusted the poses, that is, unless those of the input fit within ingest.refine_above",
+    )
     unexplained: float = Field(
-        0.0,
+        0.1,
         ge=0,
         le=1,
-        description="difference of colour (sRGB, mean of a neighbourhood, e.g. 0.05) above which unexplained "
-        "pixels count less, for captures with moving people or objects; 0 = off",
+        description="difference of colour (sRGB, mean of a neighbourhood) above which a region that the "
+        "scene of the other frames does not explain is treated as movement and does not count; 0 = off",
     )
+
+    @field_validator("pose", mode="before")
+    @classmethod
+    def _pose_was_true_or_false(cls, value: object) -> object:
+        return ("on" if value else "off") if isinstance(value, bool) else value
 
     accept: ClassVar[float] = 0.02
     """Share of a frame's misfit that a model must explain to be accepted (docs/experiments/formation.md)."""
@@ -111,6 +120,11 @@ class TrainConfig(Settings):
         gt=0,
         le=1,
         description="end of this training in the schedule, as a fraction",
+    )
+    background: tuple[Unit, Unit, Unit] | None = Field(
+        None,
+        description="sRGB behind the scene; unset = black, and in training a random colour at each step, so "
+        "that what was filmed becomes opaque",
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")
     coarse_share: float = Field(

@@ -25,6 +25,9 @@ class Formed(Protocol):
     weight: float
     """Weight of the view: the original weight, or more if image formation explains the frame."""
 
+    mask: Tensor | None
+    """Pixels [H, W] that count, after `forward`: those of the view in which nothing moves; None: all."""
+
     def forward(self, render: Render) -> Tensor:
         """Return the observed image [H, W, 3] sRGB of a render."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,6 +58,9 @@ class Gaussians:
                 f"sh has {k} coefficients per channel", hint="give 1, 4, 9 or 16 of them (degree 0 to 3)"
             )
 
+    def __repr__(self) -> str:
+        return f"<{self.num} Gaussians, SH degree {self.sh_degree}, on {self.device}>"
+
     @property
     def num(self) -> int:
         """Number of Gaussians N."""
@@ -91,3 +95,18 @@ class Gaussians:
     def select(self, index: Tensor) -> Gaussians:
         """Return contiguous copies of the Gaussians at ``index``, a bool mask [N] or indices."""
         return Gaussians(**{name: tensor[index].contiguous() for name, tensor in self.tensors().items()})
+
+    def fault(self) -> str | None:
+        """Name the first parameter with NaN or infinity, and its number of such Gaussians; None if finite."""
+        tensors = self.tensors()
+        if self.device.type == "cpu":  # NumPy is much faster than torch here
+            finite = all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors.values())
+        else:  # waits for the GPU only once
+            finite = bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all())
+        if finite:
+            return None
+        for name, tensor in tensors.items():
+            sound = int(torch.isfinite(tensor).reshape(self.num, -1).all(1).sum())
+            if sound < self.num:
+                return f"{name} is not finite in {self.num - sound} of {self.num} Gaussians"
+        return None

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 
+from cleargs.random_streams import Stream
 from cleargs.splat.config import TrainConfig
+from cleargs.splat.scene import Colour
 from cleargs.splat.types import Rate
 
 SH_REST_DIVISOR = 5.0
@@ -29,6 +33,16 @@ def rate_factor(steps: int) -> float:
     training needs larger rates to cover the same distance (docs/training.md).
     """
     return min(MAX_RATE_FACTOR, max(1.0, math.sqrt(INRIA_STEPS / steps)))
+
+
+def random_colour(seed: Sequence[int], step: int) -> Colour:
+    """Return the colour behind the scene in a step, if the settings name none.
+
+    Only an opaque pixel has the colour of its photograph over all colours, so what was filmed becomes opaque.
+    With one colour, such as black, dark parts of the scene stay transparent.
+    """
+    red, green, blue = np.random.default_rng([*seed, Stream.BACKGROUND, step]).random(3).tolist()
+    return red, green, blue
 
 
 class Schedule:

@@ -9,10 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,10 +29,11 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.interruption import deferred_sigterm
 from cleargs.splat.kernels.cpu.jit import compiled_mark
 from cleargs.splat.kernels.cuda import support
-from cleargs.splat.scene import Scene
-from cleargs.splat.schedule import Schedule
+from cleargs.splat.scene import Colour, Scene
+from cleargs.splat.schedule import Schedule, random_colour
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import PREVIEW_SIDE, TrainLog, write_preview
 from cleargs.splat.types import Moments, Render, group
@@ -55,7 +54,7 @@ class Trained:
     rows: pa.Table
     """Log with one row per step, schema `cleargs.splat.tables.TRAIN`."""
     state: dict[str, Tensor]
-    """Content of ``state.safetensors``, from which the next training continues."""
+    """Content of ``state.safetensors``, from which the next training continues: all but the parameters."""
 
 
 class Trainer:
@@ -104,7 +103,7 @@ class Trainer:
         self._backend = backend_for(self._device)
         self._rasteriser = self._backend.rasteriser(self._device)
         self._gaussians = scene.gaussians.detach().clone().to(self._device)
-        if fault := _fault(self._gaussians):
+        if fault := self._gaussians.fault():
             raise InputError(
                 f"the initial scene is damaged: {fault}",
                 hint="repeat the stage that wrote it with --force",
@@ -176,7 +175,7 @@ class Trainer:
                     raise KeyboardInterrupt
             self.check_finite()
             self._show(task, fractions, rate)
-        state = {name: tensor.cpu() for name, tensor in self.state().items()}
+        state = {k: tensor.cpu() for k, tensor in self.state().items() if not k.startswith("parameter.")}
         return Trained(self.scene.to("cpu"), self.rows(round), state)
 
     def _warm_up(self, reporter: Reporter) -> None:
@@ -218,8 +217,11 @@ class Trainer:
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
-        render = self._render(camera, depth=formed is not None and formed.needs_depth)
+        depth = formed is not None and formed.needs_depth
+        colour = random_colour(self._seed, schedule_step) if config.background is None else None
+        render = self._render(camera, depth=depth, background=colour)
         image = render.image if formed is None else formed.forward(render)
+        mask = mask if formed is None else formed.mask
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         gradient = self._add_loss(image, target, mask, weight)
         if config.densify and self._schedule.wants_errors(schedule_step):
@@ -271,7 +273,7 @@ class Trainer:
 
     def check_finite(self) -> None:
         """Raise StageError with the step and the parameter if a value is NaN or infinite."""
-        if fault := _fault(self._gaussians):
+        if fault := self._gaussians.fault():
             raise self._error_at_step(fault)
         if self._formation is not None and (fault := self._formation.fault()):
             raise self._error_at_step(fault)
@@ -323,8 +325,10 @@ class Trainer:
         order = np.random.default_rng([*self._seed, stream, epoch]).permutation(len(views))
         return views[int(order[position])]
 
-    def _render(self, camera: Camera, *, depth: bool) -> Render:
-        return self._rasteriser.view(self.scene, camera, depth=depth, sh_degree=self._sh_degree())
+    def _render(self, camera: Camera, *, depth: bool, background: Colour | None = None) -> Render:
+        """Render the scene over ``background`` (None: its own)."""
+        scene = self.scene if background is None else replace(self.scene, background=background)
+        return self._rasteriser.view(scene, camera, depth=depth, sh_degree=self._sh_degree())
 
     def _sh_degree(self) -> int:
         return self._schedule.sh_degree(self._schedule_step, self._gaussians.sh_degree)
@@ -394,22 +398,6 @@ class Trainer:
         )
 
 
-def _fault(gaussians: Gaussians) -> str | None:
-    """Name the first parameter with NaN or infinity and its number of Gaussians; None if all are finite."""
-    tensors = gaussians.tensors()
-    if gaussians.device.type == "cpu":  # NumPy is much faster than torch here
-        finite = all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors.values())
-    else:  # waits for the GPU only once
-        finite = bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all())
-    if finite:
-        return None
-    for name, tensor in tensors.items():
-        sound = int(torch.isfinite(tensor).reshape(gaussians.num, -1).all(1).sum())
-        if sound < gaussians.num:
-            return f"{name} is not finite in {gaussians.num - sound} of {gaussians.num} Gaussians"
-    return None
-
-
 def _fingerprint(
     scene: Scene, views: Sequence[TrainingView], config: TrainConfig, others: Sequence[float | str]
 ) -> Tensor:
@@ -424,24 +412,3 @@ def _fingerprint(
     for tensor in scene.gaussians.tensors().values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)
-
-
-@contextmanager
-def deferred_sigterm() -> Iterator[Callable[[], bool]]:
-    """Defer SIGTERM within the block, and yield a function that returns True after a SIGTERM.
-
-    The block then saves its state and raises KeyboardInterrupt. Clusters send SIGTERM before a time limit, so
-    that a job can save. Signals are not deferred outside the main thread, where Python runs no signal
-    handlers, or if the program has no handler for SIGTERM.
-    """
-    received = threading.Event()
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGTERM)
-    if not in_main_thread or not callable(before):
-        yield received.is_set
-        return
-    signal.signal(signal.SIGTERM, lambda number, frame: received.set())
-    try:
-        yield received.is_set
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -35,6 +35,37 @@ class TrainingView:
     """Function that returns the image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and the mask [H, W] (True:
     the pixel counts) or None. The cache calls it when it needs the image, and again if it could not keep
     it."""
+    estimated: bool = False
+    """True if the camera's pose is an estimate, and not one of the input that fits the images."""
+
+
+class ViewDataset(torch.utils.data.Dataset[dict[str, Any]]):
+    """Training views as a dataset of torch. An item is read from its image file when it is needed.
+
+    An item is a dict: ``image`` [3, H, W] float32 sRGB in [0, 1], ``mask`` [H, W] bool (True: the pixel
+    counts), ``K`` [3, 3] and ``camera_to_world`` [4, 4] float32 (OpenCV axes), ``weight`` and ``frame_id``.
+    """
+
+    def __init__(self, views: Sequence[TrainingView]) -> None:
+        self._views = views
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        view = self._views[index]
+        camera, (pixels, mask) = view.camera, view.load()
+        image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)
+        counts = np.ones(pixels.shape[:2], np.bool_) if mask is None else mask
+        intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+        return {
+            "image": image / 255.0 if image.dtype == torch.uint8 else image,
+            "mask": torch.from_numpy(counts),
+            "K": torch.tensor(intrinsics),
+            "camera_to_world": torch.from_numpy(np.linalg.inv(camera.world_to_camera)).float(),
+            "weight": view.weight,
+            "frame_id": view.frame_id,
+        }
 
 
 def require_views(views: Sequence[TrainingView]) -> None:

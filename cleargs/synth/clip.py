@@ -134,7 +134,7 @@ def moved(
     pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), -1).astype(np.float32)
     total = np.zeros_like(source)
     for index in shutter.index:
-        poses = shutter.poses[index[y[:, 0].astype(int)]]  # of each row of points
+        poses = shutter.poses[index[y[:, 0].astype(int)]]  # one per row of points
         local = np.einsum("hwk,hkj->hwj", points - poses[:, None, :, 3], poses[:, :, :3])
         seen = [
             lens.fx * local[..., 0] / local[..., 2] + lens.cx,

@@ -105,7 +105,7 @@ SHAKE_GAIN = 12.0
 STRETCH_EDGE_S = 1 / FPS
 """Seconds over which the shaking rises and falls."""
 SHOT_SECONDS = 1.0
-"""Time between two photographs of somebody who stands nearly still for each."""
+"""Time between two photographs. The walk nearly stops for each."""
 SHOT_BANDS = (((0.3, 2.0), 6), ((4.0, 12.0), 8))
 """Range in Hz and number of waves of the slow drift and of the tremor of a hand that holds a camera still."""
 SHOT_SPEED = 0.05

@@ -56,6 +56,8 @@ class Protocol:
     """Single photographs with long exposures, during which the hand trembles: see `path.StillHand`."""
     phone: bool = False
     """A phone processes the frames, and a balloon moves in the room: see `cleargs.synth.phone`."""
+    moving: int = 0
+    """With ``phone``: instead of the balloon, a household of this severity; see `cleargs.synth.movers`."""
 
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -79,6 +81,8 @@ PROTOCOLS: dict[str, Protocol] = {
     ),
     # Every fifth frame of a video with 30 frames per second and a shutter that is open 5/6 of the time.
     "phone": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True),
+    "moving": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True, moving=1),
+    "moving-severe": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True, moving=2),
 }
 
 

@@ -16,8 +16,9 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
+from cleargs.synth.movers import SEVERITIES, Balloon, Household, Movers
 from cleargs.synth.optics import PINHOLE, Aperture, Lens, Shutter, low_discrepancy, phone_lens
-from cleargs.synth.path import Orbit, SceneSetup
+from cleargs.synth.path import FPS, Orbit, SceneSetup
 from cleargs.synth.room import (
     BOX,
     LEVEL_STARTS,
@@ -25,7 +26,6 @@ from cleargs.synth.room import (
     SIZE,
     SPHERE,
     TEXELS_PER_METRE,
-    Balloon,
     Room,
     make_room,
 )
@@ -309,24 +309,25 @@ def _render(
     primitives: NDArray[np.void],
     textures: NDArray[np.float32],
     light: ArrayF64,
-    track: ArrayF64,  # [S, H, 3] centre of the last primitive; [0, 0, 3]: it does not move
+    states: ArrayF64,  # [S, H, M, 4] centre and brightness of the last M primitives; M = 0: nothing moves
     image: ArrayF64,
     depth: ArrayF64,
-    share: ArrayF64,  # [H, W] share of the samples that see the last primitive
+    share: ArrayF64,  # [H, W] share of the samples that see one of them in another state than at rest
 ) -> None:
     """Add the mean of the samples to ``image`` [H, W, 3], ``depth`` [H, W] (camera z) and ``share``."""
     passes, height, width = poses.shape[0], image.shape[0], image.shape[1]
-    last = primitives.shape[0] - 1
+    moving = states.shape[2]
+    first = primitives.shape[0] - moving
     for row in prange(height):
-        items = primitives.copy() if track.shape[0] else primitives
+        items = primitives.copy() if moving else primitives
         origin, ray, colour, start = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         scratch = np.zeros((10, 3))
         for column in range(width):
             for number in range(passes):
                 pose = poses[number, row]
-                if track.shape[0]:
+                for item in range(moving):
                     for axis in range(3):
-                        items[last]["centre"][axis] = track[number, row, axis]
+                        items[first + item]["centre"][axis] = states[number, row, item, axis]
                 start[0] = ((column + jitter[number, 0] - cx) / fx) * focus - lens[number, 0]
                 start[1] = ((row + jitter[number, 1] - cy) / fy) * focus - lens[number, 1]
                 start[2] = focus
@@ -336,11 +337,16 @@ def _render(
                     on_lens = pose[axis, 0] * lens[number, 0] + pose[axis, 1] * lens[number, 1]
                     origin[axis] = pose[axis, 3] + on_lens
                 distance, hit = _trace(origin, ray, 1 / fx, items, textures, light, colour, scratch)
-                if hit == last:
-                    share[row, column] += 1 / passes
                 depth[row, column] += distance * focus / norm / passes
+                brightness = 1.0
+                if hit >= first:
+                    brightness = states[number, row, hit - first, 3]
+                    changed = brightness != 1.0
+                    for axis in range(3):
+                        changed |= items[hit]["centre"][axis] != primitives[hit]["centre"][axis]
+                    share[row, column] += changed / passes
                 for channel in range(3):
-                    image[row, column, channel] += colour[channel] / passes
+                    image[row, column, channel] += brightness * colour[channel] / passes
 
 
 @dataclass(frozen=True)
@@ -354,14 +360,14 @@ class RoomWorld:
         return self._expose(shutter, lens, aperture)[0]
 
     def film(
-        self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
+        self, movers: Movers, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
     ) -> tuple[ArrayF64, ArrayF64]:
-        """Render the room with a balloon that moves during the exposure.
+        """Render the room with what moves in it during the exposure.
 
         Returns:
-            Linear light [H, W, 3], and per pixel [H, W] the share of the exposure that sees the balloon.
+            Linear light [H, W, 3], and per pixel [H, W] the share of the exposure that sees movement.
         """
-        image, _, share = self._expose(shutter, lens, aperture, balloon)
+        image, _, share = self._expose(shutter, lens, aperture, movers)
         return image, share
 
     def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
@@ -370,26 +376,34 @@ class RoomWorld:
         return self._expose(middle, lens, PINHOLE)[1]
 
     def _expose(
-        self, shutter: Shutter, lens: Lens, aperture: Aperture, balloon: Balloon | None = None
+        self, shutter: Shutter, lens: Lens, aperture: Aperture, movers: Movers | None = None
     ) -> tuple[ArrayF64, ArrayF64, ArrayF64]:
-        """Return image, depth, and the share of the samples that see the last primitive; see `_render`."""
-        primitives, track = self.room.primitives, np.empty((0, 0, 3))
-        if balloon is not None:
+        """Return image, depth, and the share of the samples that see movement; see `_render`."""
+        primitives, states = self.room.primitives, np.empty((0, 0, 0, 4))
+        if movers is not None:
             times = np.broadcast_to(shutter.times, len(shutter.poses))[shutter.index]
-            primitives, track = np.append(primitives, balloon.item), balloon.centres(times)
+            fixed = primitives[: len(primitives) - movers.resting]
+            primitives, states = np.concatenate([fixed, movers.items]), movers.states(times)
         size = lens.height, lens.width
         image, depth, share = np.zeros((*size, 3)), np.zeros(size), np.zeros(size)
         points = np.ascontiguousarray(np.broadcast_to(aperture.points, (shutter.samples, 2)))
         _render(
             shutter.poses[shutter.index], low_discrepancy(shutter.samples), points, aperture.focus,
-            lens.fx, lens.fy, lens.cx, lens.cy, primitives, self.room.textures, self.room.light, track,
+            lens.fx, lens.fy, lens.cx, lens.cy, primitives, self.room.textures, self.room.light, states,
             image, depth, share,
         )  # fmt: skip
         return image, depth, share
 
 
-def room_setup(frames: int, width: int, height: int, seed: int) -> SceneSetup:
-    """Return the procedural room of ``seed`` with a balloon, and a walk around its table."""
+def room_setup(frames: int, width: int, height: int, seed: int, moving: int = 0) -> SceneSetup:
+    """Return the procedural room of ``seed``, what moves in it, and a walk around its table.
+
+    ``moving`` is a key of `SEVERITIES`; 0: a balloon.
+    """
     room = make_room(seed)
+    movers: Movers = Balloon(room, seed)
+    if moving:
+        movers = household = Household(room, frames / FPS, seed, SEVERITIES[moving])
+        room = household.room
     world, course, lens = RoomWorld(room), Orbit(room.focus, frames, seed), phone_lens(width, height)
-    return SceneSetup("room", world, course, lens, partial(world.film, Balloon(room, seed)))
+    return SceneSetup("room", world, course, lens, partial(world.film, movers))

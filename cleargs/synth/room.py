@@ -1,4 +1,4 @@
-"""A procedural room with textured walls, posters, furniture, balls and thin rods, and a balloon to add.
+"""A procedural room with textured walls, posters, furniture, balls and thin rods.
 
 Textures are seeded and periodic. They have detail at all scales, so that SIFT finds features on all surfaces.
 """
@@ -116,16 +116,13 @@ class Room:
     focus: NDArray[np.float64]  # [3] target of the camera
 
 
-SWAY = np.array([0.75, 0.08, 0.2])
-"""Amplitude of a balloon's motion per axis, metres."""
-
 WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5
 """Size of the room, metres."""
 FLOOR = 0.004
 """Half the thickness of the floor covering, metres."""
 
 
-def _primitive(
+def primitive(
     kind: int,
     centre: tuple[float, float, float],
     size: tuple[float, float, float],
@@ -136,6 +133,7 @@ def _primitive(
     gloss: float = 0.0,
     shadow: bool = True,
 ) -> NDArray[np.void]:
+    """Return a scalar of `PRIMITIVE`: a box, sphere or rod with its axes turned, angles in radians."""
     cy, sy, ct, st = np.cos(yaw), np.sin(yaw), np.cos(tilt), np.sin(tilt)
     turn = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, ct, -st], [0, st, ct]])
     bound = size[0] if kind == SPHERE else float(np.linalg.norm(size))
@@ -151,9 +149,9 @@ def make_room(seed: int) -> Room:
     def material() -> int:
         return int(rng.integers(SURFACES))
 
-    items = [_primitive(BOX, (0, HEIGHT / 2, 0), (WIDTH / 2, HEIGHT / 2, DEPTH / 2), 0, shadow=False)]
+    items = [primitive(BOX, (0, HEIGHT / 2, 0), (WIDTH / 2, HEIGHT / 2, DEPTH / 2), 0, shadow=False)]
     floor = (WIDTH / 2, FLOOR, DEPTH / 2)
-    items.append(_primitive(BOX, (0, FLOOR, 0), floor, 1, gloss=0.15, shadow=False))
+    items.append(primitive(BOX, (0, FLOOR, 0), floor, 1, gloss=0.15, shadow=False))
 
     for number in range(5):  # posters on the back wall and on both side walls
         poster = SURFACES + number % PRINTS
@@ -161,62 +159,41 @@ def make_room(seed: int) -> Room:
         if number < 3:
             x = (number - 1) * 1.55 + rng.uniform(-0.15, 0.15)
             centre = (x, rng.uniform(1.35, 1.75), -DEPTH / 2 + 0.015)
-            items.append(_primitive(BOX, centre, half, poster, gloss=0.25, shadow=False))
+            items.append(primitive(BOX, centre, half, poster, gloss=0.25, shadow=False))
         else:
             side = 1.0 if number == 3 else -1.0
             centre = (side * (WIDTH / 2 - 0.015), rng.uniform(1.2, 1.6), rng.uniform(-1.3, -0.3))
-            items.append(_primitive(BOX, centre, half, poster, yaw=np.pi / 2, shadow=False))
+            items.append(primitive(BOX, centre, half, poster, yaw=np.pi / 2, shadow=False))
 
     table = (rng.uniform(-0.2, 0.2), 0.72, rng.uniform(-0.75, -0.55))
-    items.append(_primitive(BOX, table, (0.75, 0.03, 0.42), material(), gloss=0.2))
+    items.append(primitive(BOX, table, (0.75, 0.03, 0.42), material(), gloss=0.2))
     for dx in (-0.68, 0.68):  # its legs
         for dz in (-0.36, 0.36):
             leg = (table[0] + dx, 0.345, table[2] + dz)
-            items.append(_primitive(ROD, leg, (0.025, 0.345, 0), material()))
+            items.append(primitive(ROD, leg, (0.025, 0.345, 0), material()))
     for _ in range(4):  # boxes and balls on the table
         half = tuple(rng.uniform(0.06, 0.14, 3))
         centre = (table[0] + rng.uniform(-0.6, 0.6), 0.75 + half[1], table[2] + rng.uniform(-0.28, 0.28))
         texture = SURFACES + int(rng.integers(PRINTS))
-        items.append(_primitive(BOX, centre, half, texture, yaw=rng.uniform(0, np.pi)))
+        items.append(primitive(BOX, centre, half, texture, yaw=rng.uniform(0, np.pi)))
     for _ in range(2):
         radius = rng.uniform(0.07, 0.12)
         centre = (table[0] + rng.uniform(-0.55, 0.55), 0.75 + radius, table[2] + rng.uniform(-0.25, 0.3))
-        items.append(_primitive(SPHERE, centre, (radius, 0, 0), material(), gloss=0.8))
+        items.append(primitive(SPHERE, centre, (radius, 0, 0), material(), gloss=0.8))
     for side in (-1.0, 1.0):  # a cupboard and a shelf on either side of it
         half = (rng.uniform(0.25, 0.4), rng.uniform(0.45, 0.8), rng.uniform(0.2, 0.3))
         centre = (side * rng.uniform(1.5, 1.9), half[1], -DEPTH / 2 + half[2] + rng.uniform(0.02, 0.4))
-        items.append(_primitive(BOX, centre, half, material(), yaw=rng.uniform(-0.3, 0.3)))
+        items.append(primitive(BOX, centre, half, material(), yaw=rng.uniform(-0.3, 0.3)))
     for _ in range(3):  # crates on the floor
         half = tuple(rng.uniform(0.12, 0.25, 3))
         centre = (rng.uniform(-1.6, 1.6), half[1], rng.uniform(0.0, 0.6))
-        items.append(_primitive(BOX, centre, half, material(), yaw=rng.uniform(0, np.pi)))
+        items.append(primitive(BOX, centre, half, material(), yaw=rng.uniform(0, np.pi)))
     for _ in range(4):  # thin rods, slightly tilted
         centre = (rng.uniform(-1.8, 1.8), rng.uniform(0.7, 0.9), rng.uniform(-1.8, -0.9))
         size = (rng.uniform(0.008, 0.02), rng.uniform(0.6, 0.8), 0.0)
         items.append(
-            _primitive(ROD, centre, size, material(), yaw=rng.uniform(0, 6), tilt=rng.uniform(0, 0.3))
+            primitive(ROD, centre, size, material(), yaw=rng.uniform(0, 6), tilt=rng.uniform(0, 0.3))
         )
 
     light = np.array([rng.uniform(-1.2, 1.2), HEIGHT - 0.3, rng.uniform(0.2, 1.2)])
     return Room(np.array(items, PRIMITIVE), textures, light, np.array([table[0], 0.95, table[2] - 0.3]))
-
-
-class Balloon:
-    """A ball that moves back and forth above the table of a room.
-
-    It touches nothing. It crosses the view from side to side in two or three seconds.
-    """
-
-    def __init__(self, room: Room, seed: int) -> None:
-        rng = np.random.default_rng([seed, Stream.BALLOON])
-        centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
-        texture = SURFACES + int(rng.integers(PRINTS))
-        self.item = _primitive(SPHERE, centre, (0.11, 0, 0), texture, gloss=0.5)
-        """The primitive at its mean position."""
-        self._rates = 2 * np.pi / rng.uniform(4, 6, 3)  # radians per second
-        self._phases = rng.uniform(0, 2 * np.pi, 3)
-
-    def centres(self, times: NDArray[np.float64]) -> NDArray[np.float64]:  # [...] seconds
-        """Return the positions [..., 3] in metres."""
-        waves = np.sin(self._rates * times[..., None] + self._phases)
-        return np.asarray(self.item["centre"] + SWAY * waves, np.float64)

@@ -17,7 +17,7 @@ from cleargs.media.encode import require_even, write_video
 from cleargs.media.exr import write_depth
 from cleargs.media.image import write_rgb
 from cleargs.parquet import column, write_table
-from cleargs.progress import Reporter
+from cleargs.progress import Reporter, log_reporter
 from cleargs.random_streams import Stream
 from cleargs.synth.clip import write_clip
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
@@ -68,21 +68,21 @@ FRAMES = pa.schema(
         column("tone_pivot", pa.float64(), "pivot of the tone curve, sRGB in [0, 1]"),
         column("sharpening", pa.float64(), "factor of the fine detail that is added; 0: none"),
         column("codec_bits_per_pixel", pa.float64(), "target rate of the H.264 coding; 0: not coded"),
-        column("moving_share", pa.float64(), "share of the pixels that see the moving object; 0: none"),
+        column("moving_share", pa.float64(), "share of the pixels that see movement; 0: none"),
     ]
 )
 """``truth/frames.parquet``. Lengths in pixels are those of the capture's images."""
 
 
 def make_capture(
-    out: Path,
-    protocol: str,
+    out: str | Path,
+    protocol: str = "mixed",
     *,
-    frames: int,
-    width: int,
-    height: int,
-    seed: int,
-    reporter: Reporter,
+    frames: int = 16,
+    width: int = 480,
+    height: int = 270,
+    seed: int = 0,
+    reporter: Reporter | None = None,
     setup: SceneSetup | None = None,
     video: bool = False,
     seconds: float | None = None,
@@ -92,11 +92,12 @@ def make_capture(
 
     ``out/images`` and ``out/transforms.json`` are the input of a run. ``out/truth/observed`` and
     ``out/truth/novel`` have the same layout with sharp 8-bit sRGB PNGs and exact poses: observed views are at
-    the middle of the frames' exposures and have ``depth/``, novel views are off the path.
+    the middle of the frames' exposures, novel views are off the path; both have ``depth/``.
     ``out/truth/frames.parquet`` (`FRAMES`) has the faults of each frame.
 
-    The truth does not contain the moving object of a world. ``out/truth/moving`` has a mask per frame: white
-    for pixels that saw the object during the exposure. Its shadow is not in the mask.
+    The truth does not contain what moves in a world. ``out/truth/moving`` has a mask per frame: white for
+    pixels that saw movement during the exposure. Shadows, and what a thing that was put elsewhere has left
+    free, are not in the mask.
 
     Args:
         out: The folder, empty or not existing.
@@ -105,7 +106,7 @@ def make_capture(
         width: Width of the images, px.
         height: Height of the images, px.
         seed: Seed of the room, the walk and the faults.
-        reporter: Receives the progress.
+        reporter: Receives the progress (default: the logger ``cleargs``).
         setup: World, course and lens for this number and size of frames; None: the room of ``seed``.
         video: Also write ``out/capture.mp4``, which the protocol phone always has.
         seconds: Length of the walk. The frames are evenly spaced in it. None: `FPS` frames per second, or
@@ -118,7 +119,11 @@ def make_capture(
 
     Raises:
         InputError: if the protocol is unknown, the folder is not empty, or a video cannot have this size.
+
+    Example:
+        cg.make_capture("small", "gs2e-medium", frames=4, width=96, height=64)
     """
+    out, reporter = Path(out), reporter or log_reporter()
     rules = find_protocol(protocol)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")
@@ -128,7 +133,7 @@ def make_capture(
         seconds = frames * SHOT_SECONDS
     rate = FPS if seconds is None else frames / seconds
     steps = frames if seconds is None or rules.shots else round(seconds * FPS)
-    setup = setup or room_setup(steps, width, height, seed)
+    setup = setup or room_setup(steps, width, height, seed, rules.moving)
     look = phone_look(seed) if rules.phone else PLAIN
     processing = {
         "tone_contrast": look.contrast,
@@ -149,12 +154,10 @@ def make_capture(
     (out / "images").mkdir(parents=True, exist_ok=True)
     with reporter.task(f"synth {protocol}", 2 * frames + count) as task:
         motions, depths, nearnesses, luminances = [], [], [], []
-        for folder in ("observed/images", "observed/depth", "novel/images"):
+        for folder in ("observed/images", "observed/depth", "novel/images", "novel/depth"):
             (out / "truth" / folder).mkdir(parents=True)
         for stem, time, pose in zip(stems, times, poses, strict=True):
-            depth = setup.world.depth(pose, setup.lens)
-            write_depth(out / "truth" / "observed" / "depth" / f"{stem}.exr", depth)
-            light = _write_sharp(out / "truth" / "observed", stem, setup, pose, look)
+            light, depth = _write_sharp(out / "truth" / "observed", stem, setup, pose, look)
             luminances.append(metered_luminance(light))
             motions.append(track_motion(path, float(time), depth, setup.lens))
             seen = depth[depth > 0]
@@ -241,7 +244,7 @@ def _expose(
         rng: Generator for the order of the points on the lens.
 
     Returns:
-        Linear light [H, W, 3], and per pixel [H, W] the share of the exposure that sees the moving object.
+        Linear light [H, W, 3], and per pixel [H, W] the share of the exposure that sees movement.
     """
     shutter, aperture = motion.shutter(fault.exposure, fault.readout), PINHOLE
     if fault.defocus > 0:
@@ -258,11 +261,15 @@ def _expose(
     return light, np.zeros(light.shape[:2])
 
 
-def _write_sharp(folder: Path, stem: str, setup: SceneSetup, pose: ArrayF64, look: Look) -> ArrayF64:
-    """Write a sharp view and return its linear light [H, W, 3]."""
+def _write_sharp(
+    folder: Path, stem: str, setup: SceneSetup, pose: ArrayF64, look: Look
+) -> tuple[ArrayF64, ArrayF64]:
+    """Write a sharp view and its depth. Return its linear light [H, W, 3] and camera z [H, W]."""
     light = setup.world.render(instant_shutter(pose, setup.lens.height), setup.lens)
     write_rgb(folder / "images" / f"{stem}.png", develop(light, look=look))
-    return light
+    depth = setup.world.depth(pose, setup.lens)
+    write_depth(folder / "depth" / f"{stem}.exr", depth)
+    return light, depth
 
 
 def _row(number: int, image: str, motion: SimulatedMotion, fault: Fault, rate: float) -> dict[str, Any]:

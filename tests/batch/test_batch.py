@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 from toy_batch import ToyBatch
 
-from cleargs.batch.loop import program
+from cleargs.batch.loop import Batch, program
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
@@ -190,6 +191,43 @@ def test_dry_run_shows_the_cost_and_summary_the_results(
     }
     assert toys.run("--until", "count", "--dry-run") == 0
     assert "attic: 0.00 h, 0.0 GB memory, 0.00 GB disk; done" in capsys.readouterr().out
+
+
+def test_a_figure_below_its_limit_is_a_failure(toys: ToyBatch, capsys: pytest.CaptureFixture[str]) -> None:
+    toys.write_sheet({"attic": ""})
+    assert toys.run("--fail-below", "minutes=0", "--no-report") == 0
+    capsys.readouterr()
+    assert toys.run("--fail-below", "minutes=60", "--no-report") == 1
+    assert "below the limit: attic: minutes 0." in capsys.readouterr().err
+    assert toys.run("--fail-below", "psnr_unseen=25", "--no-report") == 1, "the toy stages measure none"
+    for wrong, words in (("psnr", "form FIGURE=VALUE"), ("psnr=2", "choose one of disk_gb")):
+        capsys.readouterr()
+        assert toys.run("--fail-below", wrong, "--no-report") == 2 and words in capsys.readouterr().err
+
+
+def test_work_after_a_scene(toys: ToyBatch) -> None:
+    """Exports and films are made once per scene file, and a missing one is not "done"."""
+    toys.write_sheet({"attic": 'after.export = ["sog", "blender"]\nafter.render = "turntable"'})
+    (scene,) = read_scenes(toys.root / "sheet.toml")
+    batch = Batch(toys.dag, toys.folder, [scene], "cpu")
+    assert toys.run("--no-report") == 0, "the toy stages make no scene"
+    made = batch.run_folder(scene) / "scene.ply"
+    made.write_text("a scene")
+    run = str(batch.run_folder(scene))
+    assert list(batch.arguments_after(scene)) == [
+        ["export", run, "-o", "attic.sog", "--force"],
+        ["export", run, "--for", "blender", "--force"],
+        ["render", run, "-o", "attic.mp4", "--force", "--turntable"],
+    ]
+    assert batch.result(scene).state == "waiting"
+    batch.exports.mkdir()
+    for name in ("attic.sog", "attic-blender.ply", "attic.mp4"):
+        (batch.exports / name).touch()
+    assert not list(batch.arguments_after(scene)) and batch.result(scene).state == "done"
+    os.utime(batch.exports / "attic.sog", (1, 1))
+    assert [arguments[0] for arguments in batch.arguments_after(scene)] == ["export"]
+    toys.write_sheet({"attic": 'after.export = ["splat"]'})
+    assert toys.run() == 2
 
 
 def test_a_killed_batch_resumes_from_its_checkpoint(toys: ToyBatch) -> None:

@@ -87,5 +87,5 @@ def test_dot_in_a_folder_name_is_not_a_suffix(tmp_path: Path) -> None:
 def test_brackets_in_a_name_are_not_a_pattern(tmp_path: Path) -> None:
     name = "Walk [dQw4w9WgXcQ]_000012"
     write_rgb(tmp_path / f"{name}.png", np.full((4, 4, 3), 51, np.uint8))
-    found = pictures._find_image(tmp_path, name)
+    found = pictures.find_image(tmp_path, name)
     assert found is not None and np.allclose(found, 0.2)

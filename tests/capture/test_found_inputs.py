@@ -21,7 +21,8 @@ from cleargs.media.encode import write_video
 from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
 
-from .conftest import Ingest, texture
+from .conftest import Ingest, camera_to_world, texture
+from .test_data_sets import poses_bounds
 
 
 @pytest.fixture
@@ -131,7 +132,7 @@ def test_listed_images_that_are_gone_are_left_out(posed: Path) -> None:
         (posed / f"images/{index:03d}.png").unlink()
     capture = open_capture(posed, IngestConfig())
     assert len(capture.frames) == 7
-    assert any("3 of 10" in note and "images/002.png" in note for note in capture.notes)
+    assert any("3 of 10 images" in note and "images/002.png" in note for note in capture.notes)
 
 
 def test_most_listed_images_gone_is_refused(posed: Path) -> None:
@@ -329,3 +330,16 @@ def test_a_patterned_bar_does_not_keep_frames_out(images: Path, ingest: Ingest) 
     done = ingest(images)
     assert done.result.summary["registered"] == 10
     assert any("never move" in text for text in done.warnings)
+
+
+def test_poses_bounds_are_read_where_the_model_names_other_images(project: Path, ingest: Ingest) -> None:
+    """As Deblur-NeRF's folders have them: the COLMAP model names files that its authors did not publish."""
+    for index, path in enumerate(sorted((project / "images").iterdir())):
+        path.rename(path.with_name(f"IMG_{index:04d}.png"))
+    with pytest.raises(InputError, match="lists 10 images that do not exist"):
+        open_capture(project, IngestConfig())
+    np.save(project / "poses_bounds.npy", poses_bounds(camera_to_world(10)))
+    done = ingest(project)
+    assert done.result.summary["kind"] == "llff" and done.result.summary["registered"] == 10
+    assert any("10 of 10 images" in text and "poses_bounds.npy is read" in text for text in done.warnings)
+    assert externals(project, IngestConfig())["poses_bounds"] == project / "poses_bounds.npy"

@@ -23,6 +23,7 @@ from pydantic import ValidationError
 from cleargs.capture.cameras import Intrinsics, Pose, normalise, pinhole
 from cleargs.capture.capture import SourceFrame
 from cleargs.capture.choice import held_out, holdout_hash, sharpness
+from cleargs.capture.database import apply_exif_focal
 from cleargs.capture.folders import frame_key, masks_of, natural_key, spread
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.layouts.video import choose_times
@@ -30,7 +31,6 @@ from cleargs.capture.matching import loop_pairs, sequential_pairs
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.prepare import WorkFrame, read_image, read_stencil
 from cleargs.capture.sfm import job_of
-from cleargs.capture.sfm_worker import apply_exif_focal
 from cleargs.capture.sources import externals, open_capture
 from cleargs.capture.undistort import undistorter
 from cleargs.errors import InputError, StoreError

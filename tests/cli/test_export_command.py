@@ -17,9 +17,10 @@ import eval_world
 from colmap_model import write_sparse
 from eval_world import cameras, make_scene, write_run
 
-from cleargs.cli.export_pruning import crop_scene
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
+from cleargs.render.pruning import crop_scene
+from cleargs.splat.formats import padded
 from cleargs.splat.ply import read_ply
 
 
@@ -31,7 +32,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def export(run: Path, output: Path, *more: str) -> int:
-    return invoke(["export", str(run), "-o", str(output), *more])
+    return invoke(["export", str(run), "-o", str(output), "--cameras", *more])
 
 
 def test_the_ending_chooses_the_format(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,6 +69,17 @@ def test_nothing_left_to_crop_is_an_error() -> None:
     for region in ((98.0,), (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)):
         with pytest.raises(InputError, match="no Gaussian is left"):
             crop_scene(empty, region)
+
+
+def test_a_ply_of_a_low_degree_names_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Some viewers read degree 3 and degree 0 only, and show a scene of degree 1 without its colours."""
+    run = write_run(tmp_path / "low", padded(make_scene(count=20), 1), cameras())
+    write_sparse(run / "ingest")
+    assert export(run, tmp_path / "low.ply") == 0
+    assert "degree 1" in (said := capsys.readouterr().out) and "--sh-degree 3" in said
+    assert export(run, tmp_path / "full.ply", "--sh-degree", "3") == 0
+    assert "--sh-degree" not in capsys.readouterr().out
+    assert [read_ply(tmp_path / name).gaussians.sh_degree for name in ("low.ply", "full.ply")] == [1, 3]
 
 
 def test_map_coordinates_keep_their_precision(

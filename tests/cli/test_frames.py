@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from cleargs.cli.show import frame_rows, labelled, reason, short_name, worst_cue
+from cleargs.cli.show import frame_rows, labelled, reason, short_name
+from cleargs.report.frames import worst_cue
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.stages.rva import RvaConfig
 
@@ -49,7 +50,7 @@ def test_ablations_give_their_own_reasons() -> None:
 
 def test_the_worst_cue_of_both_kinds() -> None:
     assert worst_cue(row("strong", 1, 0, b_motion_blur=0.6, r_sharpness=0.5)) == "motion blur 0.60"
-    assert worst_cue(row("strong", 1, 0, b_motion_blur=0.6, r_sharpness=0.3)) == "sharpness 0.30"
+    assert worst_cue(row("strong", 1, 0, b_motion_blur=0.6, r_sharpness=0.3)) == "low sharpness 0.70"
     assert worst_cue(row("strong", 1, 0, b_motion_blur=0.1)) == "", "no fault"
 
 

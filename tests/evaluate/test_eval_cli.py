@@ -95,6 +95,21 @@ def test_given_poses_have_a_place_of_their_own(shell: Shell, run: Path, truth: P
     assert (run / "eval" / "truth-given" / "eval.json").is_file()
 
 
+def test_refined_poses_are_a_second_figure(shell: Shell, tmp_path: Path) -> None:
+    """The figures at the given poses stay, in the table and in the JSON."""
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, [turned(camera, 1.0) for camera in cameras(3)])
+    truth = write_reference(tmp_path / "truth", scene, cameras(3))
+    options = (run, "--reference", truth, "--poses", "given", "--refine-poses", "8", *FAST)
+    _, table, _ = shell(*options)
+    assert len([line for line in table.splitlines() if "mean of 3" in line]) == 2
+    assert "g0, poses refined" in table
+    plain, refined = json.loads(shell(*options, "--json")[1])["evaluations"]
+    assert (plain["options"]["refine_poses"], refined["options"]["refine_poses"]) == (0, 8)
+    # A degree is 10 px of these cameras.
+    assert plain["means"]["psnr"] < 35 < 45 < refined["means"]["psnr"]
+
+
 def test_a_scene_file_and_renders(shell: Shell, run: Path, truth: Path, tmp_path: Path) -> None:
     result = tmp_path / "found.json"
     code, out, _ = shell(run / "g0" / "scene.ply", "--reference", truth, "-o", result, "--json", *FAST)
@@ -262,3 +277,24 @@ def test_cameras_on_a_line_align_nothing(shell: Shell, tmp_path: Path) -> None:
     sfm = write_run(tmp_path / "sfm", make_scene(), row, poses="sfm")
     folder = write_reference(tmp_path / "row", make_scene(), row, similarity=WORLD)
     fails(shell(sfm, "--reference", folder, *FAST), "line")
+
+
+def test_novel_views_are_aligned_by_the_observed_ones(shell: Shell, tmp_path: Path) -> None:
+    """Views off the path have the stems of other frames. Once, the worlds were aligned by these."""
+    scene, views = make_scene(), cameras()
+    sfm = write_run(tmp_path / "sfm", scene, views, poses="sfm")
+    write_reference(tmp_path / "truth" / "observed", scene, views, similarity=WORLD)
+    novel = write_reference(tmp_path / "truth" / "novel", scene, views[::-1], similarity=WORLD)
+    code, out, _ = shell(sfm, "--reference", novel, *FAST)
+    assert code == 0 and "residual 0.00%" in out
+    (novel.parent / "observed").rename(tmp_path / "elsewhere")
+    fails(shell(sfm, "--reference", novel, *FAST), "too large for a comparison")
+
+
+def test_a_figure_below_its_limit_fails(shell: Shell, run: Path, truth: Path) -> None:
+    given = (run, "--reference", truth, *FAST, "--fail-below")
+    code, out, _ = shell(*given, "psnr=1")
+    assert code == 0 and "PSNR" in out
+    code, out, err = shell(*given, "psnr=200", "--fail-below", "ssim=0")
+    assert code == 1 and "PSNR" in out and "below the limit: rivr: psnr" in err and "ssim" not in err
+    assert "choose one of" in shell(*given, "psrn=20")[2]

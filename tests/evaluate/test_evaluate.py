@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -38,6 +39,7 @@ from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.references import Reference, align_cameras, reference_of, umeyama
 from cleargs.media.image import read_rgb, write_mask, write_rgb
+from cleargs.splat.render import render
 
 SAME = Similarity(np.eye(3), np.zeros(3), 1.0)
 
@@ -354,6 +356,26 @@ def test_refined_poses_are_kept_only_where_they_are_better(
         assert image.refinement is not None and image.refinement.rotation_deg == 0
         assert image.refinement.loss_after == image.refinement.loss_before
     assert psnr_of(refined) == psnr_of(plain)
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_a_scene_is_measured_over_white_too(tmp_path: Path, opaque: bool) -> None:
+    """Transparent parts show the background of a viewer; opaque ones look the same over any."""
+    scene = replace(make_scene(count=3000 if opaque else 100), background=(0.0, 0.0, 0.0))
+    run = write_run(tmp_path / "run", scene, cameras())
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME)
+    found = measured(run / "g0" / "scene.ply", in_own_world(folder))
+    for image, camera in zip(found.images, cameras(), strict=True):
+        black, white = (
+            render(scene.gaussians, camera, background=(shade,) * 3).image.double().clamp(0.0, 1.0)
+            for shade in (0.0, 1.0)
+        )
+        between = -10 * math.log10(float((black - white).square().mean()))
+        assert image.psnr_between == pytest.approx(between, abs=0.1)
+        # The references are renders over black, in steps of 1/255 (59 dB).
+        assert image.psnr_white is not None
+        assert image.psnr_white > 55 if opaque else image.psnr_white == pytest.approx(between, abs=0.5)
+    assert found.psnr_between is not None and (found.psnr_between > 45) == opaque
 
 
 def test_psnr_with_aligned_colours_is_there_too(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -21,6 +23,7 @@ from cleargs.formation.comparison import FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
+from cleargs.formation.movement import still_pixels
 from cleargs.formation.observed import render_observed
 from cleargs.formation.search import search
 from cleargs.formation.table import read_formation, write_formation
@@ -47,10 +50,13 @@ CONFIG = TrainConfig(
     lr_sh=2e-3,
     opacity_reg=0.0,
     scale_reg=0.0,
+    background=(0.0, 0.0, 0.0),  # the wall has gaps
 )
 LOOK = FormationConfig(start=0.0, every=4)
 BLURRED = 2
 BLUR = FrameMotion(blur=np.array([0, 0, 0, 0, 7.0, 0]), median_depth=3.0)
+BENT = replace(BLUR, bend=np.array([0, 0, 0, 26.0, 0, 0]))
+"""An arc: the camera also nods by a quarter of the bend, 6.5 px, down and up again."""
 
 
 def camera(angle: float) -> Camera:
@@ -78,11 +84,13 @@ def scene() -> Scene:
     )
 
 
-def views(blurred: int | None = BLURRED, weights: list[float] | None = None) -> list[TrainingView]:
+def views(
+    blurred: int | None = BLURRED, weights: list[float] | None = None, motion: FrameMotion = BLUR
+) -> list[TrainingView]:
     made = []
     for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
         view = TrainingView(index, camera(angle), 1.0, "real", lambda: (None, None))
-        moved = FrameFormation(index, BLUR, "blur", reach_px=4.0) if index == blurred else None
+        moved = FrameFormation(index, motion, "blur", reach_px=4.0) if index == blurred else None
         seen = render_observed(scene(), view, formation=moved).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         weight = 1.0 if weights is None else weights[index]
@@ -104,6 +112,64 @@ def test_a_blurred_frame_is_found_and_the_sharp_ones_are_left_alone(tmp_path: Pa
     found = formation.frames[BLURRED]
     assert found.blur_px == pytest.approx(7.0, abs=1.0)
     assert found.explained > 0.5
+    assert found.motion.order == 1
+
+
+def test_an_arc_is_found_and_kept_in_the_table(tmp_path: Path) -> None:
+    seen = views(motion=BENT)
+    formation = CaptureFormation(seen, LOOK)
+    run(tmp_path, seen, formation)
+    found = formation.frames[BLURRED]
+    assert found.motion.order > 1 and found.explained > 0.6
+    # An exposure is the same from its end to its start, but its bend is not turned by that.
+    assert found.motion.bend[3] == pytest.approx(26.0, abs=5.0)
+    assert abs(found.motion.blur[4]) == pytest.approx(7.0, abs=1.0)
+    path = tmp_path / "formation.parquet"
+    write_formation(path, formation, dict.fromkeys(range(FRAMES), 1.0))
+    again = read_formation(path)[0][BLURRED]
+    np.testing.assert_array_equal(again.motion.vector, found.motion.vector)
+    table = pq.read_table(path)
+    assert table.column("order").to_pylist()[BLURRED] == found.motion.order
+    older = table.drop_columns([name for name in table.column_names if name.startswith(("bend", "cube"))])
+    pq.write_table(older.drop_columns("order"), path)  # as written before paths could be curved
+    assert read_formation(path)[0][BLURRED].motion.order == 1
+
+
+def test_a_wrong_pose_is_corrected_where_it_is_an_estimate(tmp_path: Path) -> None:
+    for estimated, setting, moved in (
+        (True, "auto", 3.0),
+        (False, "auto", 0.0),
+        (False, "on", 3.0),
+        (True, "off", 0.0),
+    ):
+        shifted = replace(BLUR, pose=np.array([0, 0, 0, 3.0, 0, 0]))
+        seen = [replace(view, estimated=estimated) for view in views(motion=shifted)]
+        formation = CaptureFormation(seen, LOOK.model_copy(update={"pose": setting}))
+        run(tmp_path / f"{estimated}-{setting}", seen, formation)
+        pose = formation.frames[BLURRED].motion.pose
+        # In front of a wall a step down looks like a turn.
+        assert pose[3] - pose[1] == pytest.approx(moved, abs=0.3), (estimated, setting)
+    assert FormationConfig(pose=False).pose == "off" and FormationConfig(pose=True).pose == "on"
+
+
+def test_a_common_drift_does_not_carry_the_reliable_frames_away(tmp_path: Path) -> None:
+    """Four of five poses are wrong by the same turn; the frame without a motion holds the scene in place."""
+    drift = replace(BLUR, pose=np.array([0, 0, 0, 0, 2.0, 0]))
+    seen = [
+        replace(views(k, motion=drift)[k] if k != BLURRED else views(None)[k], estimated=True)
+        for k in range(FRAMES)
+    ]
+    formation = CaptureFormation(seen, LOOK)
+    trained = run(tmp_path, seen, formation)
+    anchor = formation.frames[BLURRED]
+    assert anchor.model == "none" and not anchor.motion.vector.any()
+    corrections = [
+        frame.motion.pose[4] + frame.motion.pose[0] for k, frame in formation.frames.items() if k != BLURRED
+    ]
+    assert corrections == pytest.approx([2.0] * (FRAMES - 1), abs=0.4)
+    sharp = views(None)[BLURRED]
+    error = render_observed(trained.scene, sharp) - torch.from_numpy(sharp.load()[0].astype(np.float32) / 255)
+    assert float(error.square().mean()) < 1e-3
 
 
 def test_with_it_a_blurred_frame_teaches_a_sharp_scene(tmp_path: Path) -> None:
@@ -162,6 +228,14 @@ def test_every_frame_is_searched_at_the_first_look(tmp_path: Path, searched: lis
     assert len(searched) == FRAMES
 
 
+def test_a_draft_searches_only_frames_with_evidence(tmp_path: Path, searched: list[FramePair]) -> None:
+    first = {k: FrameFormation(k, skew_gain=NO_TEST) for k in range(FRAMES)}
+    formation = CaptureFormation(views(), LOOK, known=first, draft=True)
+    run(tmp_path, views(), formation)
+    assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
+    assert len(searched) == 1
+
+
 def test_later_only_a_frame_with_evidence_is_searched(tmp_path: Path, searched: list[FramePair]) -> None:
     """After that its motion is followed."""
     formation = CaptureFormation(views(), LOOK, known=known())
@@ -216,22 +290,54 @@ def crossed() -> list[TrainingView]:
 
 
 def test_what_moves_teaches_little(tmp_path: Path) -> None:
-    """Every place is covered in one view of five at most; without the weights a fifth of the red stays."""
+    """Every place is covered in one view of five at most; without masks a fifth of the red stays.
+
+    The first looks have no witnesses, so that a little is learned before the masks are there.
+    """
     errors = {}
     for name, tolerance, motions in (("plain", 0.0, True), ("doubted", 0.05, True), ("alone", 0.05, False)):
         look = FormationConfig(start=0.0, unexplained=tolerance, enabled=motions)
         trained = run(tmp_path / name, crossed(), CaptureFormation(crossed(), look))
         shown = [render_observed(trained.scene, view) - render_observed(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
-    assert errors["doubted"] < 0.1 * errors["plain"], errors
-    assert errors["alone"] < 0.1 * errors["plain"], errors
+    assert errors["doubted"] < 0.2 * errors["plain"], errors
+    assert errors["alone"] < 0.2 * errors["plain"], errors
 
 
-def test_a_resumed_training_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_repair_does_not_teach_where_its_frame_moves() -> None:
+    cells = np.zeros((21, 32), np.bool_)
+    cells[5:9, 10:15] = True
+    formation = CaptureFormation(views(), FormationConfig(start=1.0), moving={1: cells})
+    target, mask = torch.zeros(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, :5] = False
+    for kind in ("real", "pseudo"):
+        view = replace(views()[1], kind=kind)
+        formed = formation.form(view, 1.0, 0.0, target, mask, lambda camera: pytest.fail("no look is due"))
+        assert formed is not None and formed.mask is not None
+        expected = mask & torch.from_numpy(still_pixels(cells, HEIGHT, WIDTH))
+        assert torch.equal(formed.mask, expected) and not bool(expected.all())
+    other = formation.form(views()[2], 1.0, 0.0, target, mask, lambda camera: pytest.fail("no look is due"))
+    assert other is None
+
+
+def test_where_nothing_moves_a_training_has_the_bits_of_one_without_looks(tmp_path: Path) -> None:
+    seen, scenes = views(blurred=None), []
+    for name, tolerance in (("off", 0.0), ("on", 0.05)):
+        formation = CaptureFormation(seen, FormationConfig(enabled=False, unexplained=tolerance))
+        scenes.append(run(tmp_path / name, seen, formation).scene.gaussians.tensors())
+    assert all(torch.equal(tensor, scenes[1][name]) for name, tensor in scenes[0].items())
+
+
+@pytest.mark.parametrize("motion", [BLUR, BENT], ids=["straight", "curved"])
+def test_a_resumed_training_is_the_same(
+    motion: FrameMotion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = [replace(view, estimated=True) for view in views(motion=motion)]
+
     def formation() -> CaptureFormation:
-        return CaptureFormation(views(), LOOK, exposure=Exposure.identity(range(FRAMES)), lr_exposure=1e-3)
+        return CaptureFormation(seen, LOOK, exposure=Exposure.identity(range(FRAMES)), lr_exposure=1e-3)
 
-    whole = run(tmp_path / "whole", views(), formation())
+    whole = run(tmp_path / "whole", seen, formation())
     step, steps = Trainer.step, iter(range(40))
 
     def killed(trainer: Trainer) -> None:
@@ -241,8 +347,8 @@ def test_a_resumed_training_is_the_same(tmp_path: Path, monkeypatch: pytest.Monk
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Trainer, "step", killed)
-        run(tmp_path / "cut", views(), formation())
-    resumed = run(tmp_path / "cut", views(), formation())
+        run(tmp_path / "cut", seen, formation())
+    resumed = run(tmp_path / "cut", seen, formation())
     assert whole.state.keys() == resumed.state.keys()
     for name, tensor in whole.state.items():
         assert torch.equal(tensor, resumed.state[name]), name

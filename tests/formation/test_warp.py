@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -9,9 +11,11 @@ import torch
 from helpers.observations import CAMERA, MEDIAN, Image, twist, wall, wall_fields
 from helpers.warp_oracle import (
     ALL,
+    BENT,
     LONG,
     ROLLED,
     SCALE,
+    SLIGHTLY_BENT,
     SMALL,
     constant_fields,
     dot,
@@ -22,7 +26,7 @@ from helpers.warp_oracle import (
 )
 from torch import Tensor
 
-from cleargs.formation.motion import FrameMotion
+from cleargs.formation.motion import FrameMotion, pixel_paths
 from cleargs.formation.warp import (
     Warp,
     displacement_fields,
@@ -43,13 +47,24 @@ Doubles = npt.NDArray[np.float64]
 CPU = torch.device("cpu")
 
 
+MOTIONS = {
+    "many samples": ALL,
+    "one sample": ROLLED,
+    "two passes": LONG,
+    "curved": BENT,
+    "curved, two passes": SLIGHTLY_BENT,
+}
+
+
 @pytest.mark.parametrize("margin", [0, 12])
-@pytest.mark.parametrize("motion", [ALL, ROLLED, LONG], ids=["many samples", "one sample", "two passes"])
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int) -> None:
     wide = torch.from_numpy(np.pad(wall(), margin, mode="edge"))
     fields = displacement_fields(motion, CAMERA, wide, torch.ones_like(wide), margin)
     warp = Warp.of(fields, margin)
-    assert (len(warp.samples) == 1) == (motion is ROLLED) and (warp.between is None) == (motion is not LONG)
+    assert (len(warp.samples) == 1) == (motion is ROLLED)
+    assert (warp.between is not None) == (motion in (LONG, SLIGHTLY_BENT))
+    assert (fields.curve is None) == (motion not in (BENT, SLIGHTLY_BENT))
     image = random_image(*wide.shape)
     expected = oracle(image[..., :3], warp)
     made = warp.forward(image)[..., :3]
@@ -64,7 +79,7 @@ def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int
     assert np.abs(gradient).max() > 0.5
 
 
-@pytest.mark.parametrize("motion", [ALL, LONG], ids=["one pass", "two passes"])
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_transpose_is_the_transpose(motion: FrameMotion) -> None:
     rng = np.random.default_rng(0)
     fields = wall_fields(motion)
@@ -92,6 +107,8 @@ CASES = {
     "many samples": lambda: moved(ALL),
     "one sample": lambda: moved(ROLLED),
     "two passes": lambda: moved(LONG),
+    "curved": lambda: moved(BENT),
+    "curved, two passes": lambda: moved(SLIGHTLY_BENT),
     "longer than the image": lambda: (constant_fields(9, 14, 60.0, 0.0), 0),
     "higher than the image": lambda: (constant_fields(9, 14, 0.0, 60.0, 2.0), 0),
     "one pixel": lambda: (constant_fields(1, 1, 5.0, 5.0, 1.0), 0),
@@ -240,6 +257,43 @@ def test_two_passes_give_what_one_with_all_samples_gives() -> None:
     assert max(difference[:, :95].max(), difference[:, 105:-4].max()) < 1e-3
 
 
+@pytest.mark.parametrize("bend", [2.0, 6.0])
+def test_two_passes_along_a_curve_give_what_one_with_all_samples_gives(bend: float) -> None:
+    """A blur of 30 px that bends by a sixth of ``bend``; the parts differ from their mean by half a pixel."""
+    motion = FrameMotion(
+        blur=twist(0, 0, 0, 0, 30, 0),
+        bend=twist(0, 0, 0, bend, 0, 0),
+        cube=twist(0, 0, 0, 0, 6, 0),
+        median_depth=MEDIAN,
+    )
+    fields = wall_fields(motion)
+    two, one = Warp.of(fields), Warp(fields, 0, torch.from_numpy(samples(64)))
+    assert two.between is not None and len(two.samples) + len(two.between.samples) < 20
+    y, x = np.indices(wall().shape, float)
+    waves = 0.5 + 0.2 * np.sin(x / 3.0) * np.cos(y / 2.0)
+    image = torch.from_numpy(padded(np.repeat(waves[..., None], 3, 2).astype(np.float32)))
+    straight = Warp(fields._replace(curve=None), 0, torch.from_numpy(samples(64)))
+    inner = np.s_[4:-4, 20:-20, 0]
+    error = (two.forward(image) - one.forward(image))[inner].abs().max()
+    # The waves span 0.4, and what a straight path would give is 0.01 and 0.04 away.
+    assert error < 0.004 < (straight.forward(image) - one.forward(image))[inner].abs().max()
+
+
+def test_the_paths_of_pixels_are_those_of_the_fields() -> None:
+    times = np.array([-0.5, -0.1, 0.3])
+    motion = replace(BENT, pose=np.zeros(6))
+    fields = displacement_fields(motion, CAMERA, torch.full(wall().shape, MEDIAN), torch.ones(wall().shape))
+    assert fields.curve is not None
+    shape = CAMERA.height, CAMERA.width
+    found = pixel_paths(motion, CAMERA, shape, times)
+    for t, displacement in zip(times, found, strict=True):
+        curve = (t**2 - 1 / 12) * fields.curve[:2] + (t**3 - 0.15 * t) * fields.curve[2:]
+        np.testing.assert_allclose(displacement, (t * fields.sweep + curve).permute(1, 2, 0), atol=1e-4)
+    # A coarse grid has the paths of the pixels at its centres.
+    coarse = pixel_paths(motion, CAMERA, (CAMERA.height // 5, CAMERA.width // 5), times)
+    np.testing.assert_allclose(coarse, found[:, 2::5, 2::5], atol=1e-4)
+
+
 def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
     values = np.linspace(-0.1, 2.5, 9973).reshape(-1, 1, 1).repeat(3, 2).astype(np.float32)
     usual = (values > 0) & (values < CURVE_LAST)
@@ -286,7 +340,7 @@ def test_the_whole_chain_has_the_gradient_that_finite_differences_show() -> None
     assert dot(gradient, direction) == pytest.approx(difference, rel=2e-3)
 
 
-@pytest.mark.parametrize("motion", [ALL, LONG], ids=["one pass", "two passes"])
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_threads_do_not_change_a_bit(motion: FrameMotion) -> None:
     image = random_image(*wall().shape)
     results = []

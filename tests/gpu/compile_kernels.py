@@ -32,7 +32,7 @@ F32, F64, I16, I32, I64, U8 = "*fp32", "*fp64", "*i16", "*i32", "*i64", "*u8"
 SCENE = dict.fromkeys(("means", "log_scales", "rotations", "logits", "sh"), F32)
 SIZE = {"width": "i32", "height": "i32"}
 IMAGE = {"image": F32, "target": F32, "height": "i32", "length": "i32"}
-FIELDS = dict.fromkeys(("offset", "sweep", "radius"), F32)
+FIELDS = dict.fromkeys(("offset", "sweep", "radius", "curve"), F32)
 PHOTOGRAPH = {"height": "i32", "width": "i32", "margin": "i32"}
 GRADIENTS = {f"grad_{name}": F32 for name in SCENE}
 UNFUSED = {"enable_fp_fusion": False}
@@ -72,7 +72,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
         (
             frame_warp.displace,
             {**dict.fromkeys(("depth", "alpha", "motion"), F32), **FIELDS, **PHOTOGRAPH},
-            {"BLOCK": frame_warp.BLOCK},
+            {"CURVED": True, "BLOCK": frame_warp.BLOCK},
             {},
         ),
         (
@@ -84,7 +84,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
     ]
     for taps in (2, 4):
         sampled = {**FIELDS, "samples": F32, **PHOTOGRAPH, "count": "i32"}
-        constants = {"TAPS": taps, "BLOCK": frame_warp.BLOCK}
+        constants = {"TAPS": taps, "CURVED": taps == 2, "BLOCK": frame_warp.BLOCK}
         found += [
             (
                 frame_warp.gather_light,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import splat_toy
-from helpers.warp_oracle import ALL, SCALE, SMALL, constant_fields, placed, random_image, scenery
+from helpers.warp_oracle import ALL, BENT, SCALE, SMALL, constant_fields, placed, random_image, scenery
 from torch import Tensor
 
 from cleargs.formation.capture import CaptureFormation
@@ -49,12 +49,14 @@ def both(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> Both:
 
 
 @pytest.mark.parametrize("margin", [0, 4])
-def test_the_fields_are_those_of_the_cpu(both: Both, margin: int) -> None:
+@pytest.mark.parametrize("motion", [ALL, BENT], ids=["straight", "curved"])
+def test_the_fields_are_those_of_the_cpu(both: Both, motion: FrameMotion, margin: int) -> None:
     found, expected = both(
-        lambda depth, alpha: displacement_fields(ALL, SMALL, depth, alpha, margin, SCALE), *scenery(margin)
+        lambda depth, alpha: displacement_fields(motion, SMALL, depth, alpha, margin, SCALE), *scenery(margin)
     )
-    assert found.sweep.std() > 1.0
-    for mine, theirs in zip(found[:3], expected[:3], strict=True):
+    assert found.sweep.std() > 1.0 and (found.curve is None) == (motion is ALL)
+    names = ["offset", "sweep", "radius"] + (["curve"] if motion is BENT else [])
+    for mine, theirs in ((getattr(found, name), getattr(expected, name)) for name in names):
         # Up to 8 px after about ten float32 operations, whose last bits differ: at most 5e-7 observed.
         torch.testing.assert_close(mine.cpu(), theirs, rtol=0.0, atol=1e-5)
     assert enough_samples(found) == enough_samples(expected)

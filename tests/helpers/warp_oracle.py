@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from helpers.observations import MEDIAN, twist
@@ -22,6 +24,15 @@ ALL = FrameMotion(
 )
 
 ROLLED = FrameMotion(skew=twist(1, 0, 2, 3, 5, -2), median_depth=MEDIAN)
+
+BENT = replace(ALL, bend=twist(1, 0, 1, -9, 5, 2), cube=twist(0, 4, 0, 30, 25, 9))
+
+SLIGHTLY_BENT = FrameMotion(
+    blur=twist(2, 1, -1, 4, 24, 2),
+    bend=twist(0, 0, 0, 3, 2, 0),
+    cube=twist(0, 0, 0, 4, 2, 1),
+    median_depth=MEDIAN,
+)
 
 LONG = FrameMotion(blur=twist(2, 1, -1, 4, 19, 2), skew=twist(1, 0, 2, 3, 5, -2), median_depth=MEDIAN)
 
@@ -55,9 +66,11 @@ def mean_of_samples(pixels: Tensor, fields: DisplacementFields, margin: int, poi
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     total = torch.zeros(height, width, pixels.shape[2], dtype=torch.float64)
     offset, sweep, radius = (field.double().cpu() for field in fields[:3])
+    curve = torch.zeros(4, 1, 1, dtype=torch.float64) if fields.curve is None else fields.curve.double().cpu()
     for t, u, v in points.double().cpu():
-        at_x = (x + margin + offset[0] + t * sweep[0] + u * radius).clamp(0, columns - 1)
-        at_y = (y + margin + offset[1] + t * sweep[1] + v * radius).clamp(0, rows - 1)
+        aside = (t**2 - 1 / 12) * curve[:2] + (t**3 - 3 * t / 20) * curve[2:]
+        at_x = (x + margin + offset[0] + t * sweep[0] + aside[0] + u * radius).clamp(0, columns - 1)
+        at_y = (y + margin + offset[1] + t * sweep[1] + aside[1] + v * radius).clamp(0, rows - 1)
         i, j = (
             at_x.floor().clamp(max=max(columns - 2, 0)).long(),
             at_y.floor().clamp(max=max(rows - 2, 0)).long(),
@@ -103,4 +116,5 @@ def scenery(margin: int) -> tuple[Tensor, Tensor]:
 
 
 def placed(fields: DisplacementFields, device: torch.device) -> DisplacementFields:
-    return DisplacementFields(*(field.to(device) for field in fields[:3]))
+    curve = None if fields.curve is None else fields.curve.to(device)
+    return DisplacementFields(*(field.to(device) for field in fields[:3]), None, curve)

@@ -154,24 +154,24 @@ def run_on(
     bench: Bench,
     device: DeviceChoice,
     *,
-    stage: str | None = None,
+    until: str | None = None,
     folder: Path | None = None,
     store: Path | None = None,
 ) -> list[StageOutcome]:
-    """Call ``cleargs run --device DEVICE``, or ``cleargs stage``."""
+    """Call ``cleargs run --device DEVICE``."""
     (recipe := bench.root / "toy.toml").write_text("seed = 0\n")
     settings = resolve_run(
         bench.dag,
         bench.capture,
         folder or bench.folder,
-        workflow=str(recipe),
+        recipe=str(recipe),
         store=store,
         device=device,
         say=bench.remarks.info,
     )
     with DigestMemo(settings.store / "digests.sqlite") as memo:
         runner = Runner(bench.dag, settings, Store(settings.store, memo), 1, bench.remarks)
-        return [runner.run_stage(stage)] if stage else runner.run_until()
+        return runner.run_until(until)
 
 
 def devices(outcomes: list[StageOutcome]) -> dict[str, str]:
@@ -257,7 +257,7 @@ def test_other_errors_stop_the_run(breaking: Bench, monkeypatch: pytest.MonkeyPa
 def test_a_single_stage_falls_back_too(breaking: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StageError):
         run_on(breaking, "cuda")
-    assert devices(run_on(breaking, "auto", stage="square")) == {"square": "cpu"}
+    assert devices(run_on(breaking, "auto", until="square"))["square"] == "cpu"
     assert read_run_file(breaking.folder, breaking.dag).on_cpu == ("square", "total")
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import subprocess
+import sys
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -98,3 +100,14 @@ def test_without_locks_nothing_is_removed(bench: Bench) -> None:
         assert store.collect(bench.dag.names, checkpoints=False, dry_run=True)
         with pytest.raises(StoreError, match="has no locks"):
             store.collect(bench.dag.names, checkpoints=False, dry_run=False)
+
+
+def test_a_python_without_fcntl_works_without_locks(tmp_path: Path) -> None:
+    script = (
+        "import sys; sys.modules['fcntl'] = None\n"
+        "from pathlib import Path; from cleargs.pipeline.lock import file_lock, is_locked\n"
+        "path = Path(sys.argv[1])\n"
+        "with file_lock(path) as held: print(held, is_locked(path))"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "x.lock")]
+    assert subprocess.run(command, capture_output=True, text=True).stdout == "None True\n"

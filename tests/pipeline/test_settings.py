@@ -201,12 +201,12 @@ def test_malformed_run_files(bench: Bench, text: str, words: str) -> None:
 
 
 def test_a_damaged_device_hides_neither_input_nor_store(bench: Bench) -> None:
-    """``--workflow`` replaces the settings only: the run keeps its capture and its store."""
+    """``--recipe`` replaces the settings only: the run keeps its capture and its store."""
     bench.folder.mkdir()
     shared, recipe = bench.root / "shared", bench.root / "empty.toml"
     recipe.touch()
     (bench.folder / "run.toml").write_text(f'input = "/elsewhere"\nstore = "{shared}"\ndevice = "tpu"\n')
-    run = resolve_run(bench.dag, bench.capture, bench.folder, workflow=str(recipe), say=lambda line: None)
+    run = resolve_run(bench.dag, bench.capture, bench.folder, recipe=str(recipe), say=lambda line: None)
     assert run.store == shared
     with pytest.raises(InputError, match="is a run of /elsewhere"), opened_store(shared) as store:
         check_same_input(run, bench.dag, store)

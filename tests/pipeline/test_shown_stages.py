@@ -10,7 +10,6 @@ from test_interruption import start, wait_for
 from toy import Bench
 
 from cleargs.digest import DigestMemo
-from cleargs.errors import StageError
 from cleargs.manifest import read_manifest
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner
@@ -59,19 +58,6 @@ def test_new_results_hide_what_was_made_from_the_old_ones(bench: Bench) -> None:
     assert reasons(bench)["square"] == ("input count/numbers: 3.txt removed, 4.txt removed, 5.txt removed",)
     bench.run("count.limit=3", until="square")
     assert shown(bench) == ["count", "square"]
-
-
-def test_stage_alone_hides_what_it_affects(bench: Bench) -> None:
-    bench.run()
-    for number in (3, 4, 5):
-        (bench.capture / f"{number}.txt").unlink()
-    run = read_run_file(bench.folder, bench.dag)
-    with DigestMemo(run.store / "digests.sqlite") as memo:
-        runner = Runner(bench.dag, run, Store(run.store, memo), 1, bench.remarks)
-        runner.run_stage("count")
-        assert shown(bench) == ["count"]
-        with pytest.raises(StageError, match="needs square"):
-            runner.run_stage("total")
 
 
 def test_newer_program_hides_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from colmap_model import write_sparse
 from helpers.chromium import CHROMIUM, NO_CHROMIUM, TIMEOUT_MS
+from helpers.level_camera import level_camera
 from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
 from cleargs.report.frames import camera_of
-from cleargs.report.web_scene import level_camera, viewer_pose, write_viewer
+from cleargs.report.web_scene import viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
 from cleargs.splat.render import Viewer
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
 
 
 def export(run: FinishedRun, output: Path, *arguments: str) -> int:
-    return invoke(["export", str(run.folder), "-o", str(output), *arguments])
+    return invoke(["export", str(run.folder), "-o", str(output), "--cameras", *arguments])
 
 
 @pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != "usdc"])
@@ -60,10 +61,74 @@ def test_nothing_is_overwritten_unasked(
     assert export(run, tmp_path / "a.ply") == 2 and "give --force" in capsys.readouterr().err
     assert (tmp_path / "a.ply").read_text() == "mine" and not (tmp_path / "a.cameras.json").exists()
     assert export(run, tmp_path / "a.ply", "--force") == 0
+    (tmp_path / "a.cameras.json").write_text("mine")
     (tmp_path / "a.ply").unlink()
-    assert export(run, tmp_path / "a.ply") == 2  # the cameras are still there
-    (tmp_path / "a.cameras.json").unlink()
-    assert export(run, tmp_path / "a.ply") == 2 and not (tmp_path / "a.ply").exists()  # the model too
+    assert export(run, tmp_path / "a.ply") == 2 and "of another export" in capsys.readouterr().err
+    assert (tmp_path / "a.cameras.json").read_text() == "mine" and not (tmp_path / "a.ply").exists()
+
+
+def test_a_second_export_next_to_a_first(run: FinishedRun, tmp_path: Path) -> None:
+    """Once, the cameras of the first export made the second one fail."""
+    assert export(run, tmp_path / "a.ply") == 0
+    assert export(run, tmp_path / "a.sog") == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.cameras.json",
+        "a.colmap",
+        "a.ply",
+        "a.sog",
+    ]
+    given = ["export", str(run.folder), "-o", str(tmp_path / "b.ply"), "-o", str(tmp_path / "b.spz")]
+    assert invoke(given) == 0
+    assert not (tmp_path / "b.cameras.json").exists() and not (tmp_path / "b.colmap").exists()
+    assert read_ply(tmp_path / "b.ply").gaussians.num == 4000 and (tmp_path / "b.spz").stat().st_size > 4000
+
+
+@pytest.mark.parametrize("program", ["blender", "unreal", "unity", "supersplat", "web"])
+def test_a_program_chooses_format_and_axes(
+    run: FinishedRun, program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert invoke(["export", str(run.folder), "--for", program]) == 0
+    (file,) = tmp_path.iterdir()
+    assert file.suffix == {"supersplat": ".sog", "web": ".spz"}.get(program, ".ply")
+    if file.suffix != ".ply":
+        return
+    scene = read_ply(file).gaussians
+    assert scene.sh_degree == 3  # Blender and the game engines read no other degree
+    ahead, axis = {"blender": (1, 1), "unity": (-1, 2), "unreal": (1, 2)}[program]
+    assert float((ahead * scene.means[:, axis]).median()) > 0.5  # the wall is ahead of the first camera
+
+
+def test_a_packed_run_can_be_exported_elsewhere(run: FinishedRun, tmp_path: Path) -> None:
+    assert invoke(["pack", str(run.folder), "-o", str(tmp_path / "room.zip")]) == 0
+    with zipfile.ZipFile(tmp_path / "room.zip") as archive:
+        assert not any("candidates" in name or "/images/" in name for name in archive.namelist())
+        archive.extractall(tmp_path)
+    copy = tmp_path / run.folder.name
+    assert not [path for path in copy.rglob("*") if path.is_symlink()]
+    settings = (copy / "run.toml").read_text()
+    assert str(run.folder.parent) not in settings and "input = " in settings
+    assert invoke(["show", str(copy)]) == 0
+    for where, name in ((run.folder, "here"), (copy, "there")):
+        assert invoke(["export", str(where), "-o", str(tmp_path / f"{name}.ply"), "--up", "z"]) == 0
+    assert (tmp_path / "here.ply").read_bytes() == (tmp_path / "there.ply").read_bytes()
+    assert invoke(["pack", str(run.folder), "-o", str(tmp_path / "room.zip")]) == 2
+
+
+def test_metres(run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def positions(*more: str) -> np.ndarray:
+        assert export(run, tmp_path / "a.ply", "--force", *more) == 0
+        return np.array([one["position"] for one in json.loads((tmp_path / "a.cameras.json").read_text())])
+
+    plain, numbers = positions(), sorted(read_model(tmp_path / "a.colmap/sparse/0").images)
+    for more in ([], ["--world", "input"], ["--up", "z"]):
+        scaled = positions("--metres", f"{numbers[0] - 1}-{numbers[2] - 1}=3.5", *more)
+        assert np.linalg.norm(scaled[0] - scaled[2]) == pytest.approx(3.5)
+    shape = np.linalg.norm(plain - plain[0], axis=1) / np.linalg.norm(plain[2] - plain[0])
+    assert np.allclose(np.linalg.norm(scaled - scaled[0], axis=1) / 3.5, shape)
+    for wrong in ("0-999=2", "0=2", "0-1=0"):
+        assert export(run, tmp_path / "b.ply", "--metres", wrong) == 2
+        assert "FRAME-FRAME=METRES" in capsys.readouterr().err
 
 
 def test_an_unknown_ending_writes_nothing(

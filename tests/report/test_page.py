@@ -10,32 +10,32 @@ from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
+from cleargs.cli.main import invoke
 from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
-from cleargs.manifest import linked_manifest, write_manifest
-from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
+from cleargs.manifest import Manifest, linked_manifest, write_manifest
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
-from cleargs.report.frames import FrameRow
+from cleargs.report.advice import command
+from cleargs.report.frames import FramePictures, FrameRow, ImageFile, layers_of, load_rows
 from cleargs.report.page import (
     changed_settings,
-    command,
     frame_data,
     json_in_html,
-    weight_colour,
     write_report,
 )
-from cleargs.report.report_json import LastRun, is_current, linked_manifests
-from cleargs.report.verdict import ReportVerdict
+from cleargs.report.report_json import LastRun, cameras_of, is_current, linked_manifests
+from cleargs.report.single_file import single_file_size, write_single_file
 from cleargs.report.web_scene import SCENE_BYTES, shown_degree, write_scene
 from cleargs.rivr.tables import Selection
 
@@ -44,8 +44,27 @@ def test_a_frame_that_was_not_tried_says_why() -> None:
     frame: Any = SimpleNamespace(frame_id=3, name="c.png", registered=True, split="train")
     reason = "not tried: explained: blur 5.2 px"
     row = FrameRow(frame, rounds=(Selection.not_tried(3, reason),))
-    data = frame_data(row, {}, None)
-    assert (data["repair"], data["why"], data["scores"]) == ("none: the raw frame is kept", reason, {})
+    data = frame_data(row, FramePictures(ImageFile("a.jpg", 1, 1), {}, None), None)
+    assert (data["repair"], data["why"], data["scores"]) == ("kept as filmed", reason, {})
+    assert data["chosen"] is None, "a frame that is kept as filmed has no repair that won"
+
+
+@pytest.mark.parametrize(
+    ("poses", "errors", "expected"),
+    [
+        ("input", None, ("given", None, None)),
+        ("input", {"given": 0.9, "adjusted": 0.8}, ("given", 0.9, 0.9)),
+        ("refined", {"given": 1.7, "adjusted": 0.3}, ("adjusted", 1.7, 0.3)),
+        ("sfm", {"given": 1.7, "adjusted": 0.6, "sfm": 0.3}, ("sfm over given", 1.7, 0.3)),
+        ("sfm", None, ("sfm", None, None)),
+    ],
+)
+def test_the_report_says_how_cameras_were_placed(poses: str, errors: Any, expected: tuple[Any, ...]) -> None:
+    lenses = [{"lens": "OPENCV", "focal_px": 518.0, "frames": 96}]
+    summary = {"poses": poses, "kept_out_matches_off_px": errors, "cameras": lenses, "placed": {"given": 96}}
+    found = cameras_of({"ingest": cast(Manifest, SimpleNamespace(summary=summary))})
+    assert tuple(found[name] for name in ("method", "off_px_before", "off_px")) == expected
+    assert found["lenses"] == lenses and cameras_of({}) == {}
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +94,7 @@ def test_every_file_that_the_page_names_is_there(page: Path, parsed: Page) -> No
     named = [image["src"] for image in parsed.all("img") if "src" in image]
     data = json.loads(re.search(r'id="data">(.*?)</script>', page.read_text(), re.S)[1])
     named += [path for frame in data["frames"] for path in frame["layers"].values()]
-    named += ["viewer.js", "scene-before.js", "scene-after.js", "viewer-LICENSE.txt"]
+    named += ["viewer.js", "scene.js", "viewer-LICENSE.txt"]
     missing = [name for name in named if name and not (page.parent / name).is_file()]
     assert len(named) > 30 and not missing
     frames = {frame["id"]: frame for frame in data["frames"]}
@@ -87,9 +106,7 @@ def test_every_file_that_the_page_names_is_there(page: Path, parsed: Page) -> No
 
 def test_every_picture_says_what_it_shows(parsed: Page) -> None:
     pictures = [image for image in parsed.all("img") if "src" in image]
-    assert len(pictures) == COUNT + 2 and all(image.get("alt") for image in pictures)
-    drawings = [svg for svg in parsed.all("svg") if svg.get("aria-hidden") != "true"]
-    assert len(drawings) == 1 + 3 + 3 and all(svg.get("aria-label") for svg in drawings)
+    assert len(pictures) == COUNT + 5 + 1 and all(image.get("alt") for image in pictures)
 
 
 def test_terms_mean_what_the_glossary_says(page: Path) -> None:
@@ -116,23 +133,11 @@ def test_json_in_a_script_cannot_end_it() -> None:
     assert json.loads(text) == {"a": hostile["a"], "nan": None}
 
 
-def test_the_verdict_names_settings_that_exist(parsed: Page, run: FinishedRun) -> None:
-    chips = [button["data-copy"] for button in parsed.all("button") if button.get("class") == "chip"]
-    assert "--set ingest.holdout=every:8" in chips and "--set g0.steps=800" in chips
-    sections = run.run.config.sections
-    for chip in chips:
-        section, _, name = str(chip).removeprefix("--set ").partition("=")[0].partition(".")
-        assert name in type(sections[section]).model_fields
-    assert "Fair: the first scene matches the best training frames reasonably well." in parsed.text
-    assert "not repaired rose from 24.0 dB to 25.5 dB." in parsed.text
-    assert "1 stretch of the path" in parsed.text
-
-
 def test_settings_and_the_command_make_the_run_again(run: FinishedRun) -> None:
     changed = {name: (value, default) for name, value, default, _ in changed_settings(run.run.config)}
     assert changed["rva.tau_R"] == ("0.61", "0.7") and changed["rivr.distil.steps"] == ("100", "unset")
     assert command(run.run, run.dag) == (
-        "cleargs run 'gone & <away>.mp4' -o run --workflow smoke --set rva.tau_R=0.61"
+        "cleargs run 'gone & <away>.mp4' -o run --recipe smoke --set rva.tau_R=0.61"
     )
 
 
@@ -189,7 +194,7 @@ def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
     assert "No scene is trained yet" in text and is_current(
         run.folder, linked_manifests(run.folder, run.dag.names)
     )
-    assert "none tried" in text and "the restored frame" not in text
+    assert "none tried" in text and "the restored frame" not in text and 'id="stage"' not in text
 
 
 def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
@@ -201,7 +206,7 @@ def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
     )
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-    assert "No frame needed a repair." in text and "With the repairs" not in text
+    assert "0 repaired." in text
 
 
 def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
@@ -210,7 +215,7 @@ def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
         for stage in ("rivr", "consolidate"):
             (run.folder / stage / "manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-        assert "no repair changed it" in text and "with repairs" not in text
+        assert 'href="../g0/scene.ply"' in text and " repaired." not in text
         (run.folder / "g0/manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
         assert "No scene is trained yet" in text and 'id="stage"' not in text
@@ -226,29 +231,83 @@ def test_a_scene_in_a_report_is_bounded(tmp_path: Path) -> None:
     assert shown_degree(300_000, 0) == 0
     scene = wall(3, gaussians=3000, sh_degree=2)
     scene.gaussians.logit_opacities[:1000] = -8.0  # alpha 0.0003, stored as 0: nothing is lost
-    assert write_scene(tmp_path / "scene.js", "after", scene) == 2
+    assert write_scene(tmp_path / "scene.js", "scene", scene) == 2
     script = (tmp_path / "scene.js").read_bytes()
     packed = gzip.decompress(b64decode(script.split(b'"')[3]))
     assert b"element vertex 2000\n" in packed and len(script) < SCENE_BYTES
 
 
-def test_weights_run_from_amber_to_teal() -> None:
-    def rgb(weight: float) -> np.ndarray:
-        return np.array([int(weight_colour(weight)[k : k + 2], 16) for k in (1, 3, 5)])
+def test_the_run_folder_has_a_page_that_leads_to_the_report(page: Path) -> None:
+    entry = page.parents[1] / "report.html"
+    assert 'content="0; url=report/index.html"' in entry.read_text()
+    assert (entry.parent / "report/index.html").samefile(page)
 
-    assert rgb(0.0)[0] > 200 and rgb(1.0)[0] < 50 and (rgb(2.0) == rgb(1.0)).all()
+
+def test_a_report_in_one_file_has_all_images_and_the_scene_inside(page: Path, tmp_path: Path) -> None:
+    target = tmp_path / "one.html"
+    size = write_single_file(page, target)
+    assert size == target.stat().st_size and size == pytest.approx(single_file_size(page.parent), rel=0.1)
+    text = target.read_text()
+    sources = [image["src"] for image in Page(text).all("img") if "src" in image]
+    assert sources and all(str(source).startswith("data:image/jpeg;base64,") for source in sources)
+    files = json.loads(re.search(r"window\.files = (.*);</script>", text)[1])
+    data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])
+    layers = {path for frame in data["frames"] for path in frame["layers"].values()}
+    assert layers == files.keys()
+    name = "frames/000000-final.jpg"
+    assert b64decode(files[name].partition(",")[2]) == (page.parent / name).read_bytes()
+    assert '["viewer"]' in text and '["scene"]' in text and "window.hacked = 1</script>" not in text
 
 
-def test_advice_is_only_what_can_help() -> None:
-    def advice(frames: int, available: int, *settings: str) -> list[str]:
-        lost = FrameRow(SimpleNamespace(registered=False))  # type: ignore[arg-type]
-        manifests: Any = {"ingest": SimpleNamespace(summary={"frames_available": available}, missing=())}
-        rows: Any = [lost] * frames
-        verdict = ReportVerdict(manifests, rows, load_config(installed(), "default", settings))
-        return list(next(verdict.warnings()).settings)
+def test_the_report_shows_the_weight_with_which_a_frame_taught(run: FinishedRun) -> None:
+    frame: Any = SimpleNamespace(frame_id=3, name="c.png", registered=True, split="train")
+    judged = {"weight": 0.12, "role": "reactivated", "r_sharpness": 0.06}
+    found = {"model": "blur", "blur_px": 11.3, "weight_before": 0.12, "weight_after": 1.0}
+    row = FrameRow(frame, judged, formation=found)
+    assert (row.weight, row.teaching) == (1.0, "motion blur 11.3 px, simulated: counts fully")
+    assert FrameRow(frame, judged).teaching == "low sharpness 0.94: counts 12 %"
+    assert FrameRow(frame, judged | {"weight": 0.0}).teaching == "low sharpness 0.94: not used"
+    held: Any = SimpleNamespace(registered=True, split="test")
+    assert FrameRow(held).teaching == "held out: not used"
 
-    assert advice(40, 40) == []  # every frame is used, and compared with every other
-    assert advice(40, 60) == ["ingest.max_frames=60"]
-    assert advice(40, 60, "ingest.fps=2") == ["ingest.fps=4"]
-    assert advice(40, 40, "ingest.fps=2") == []  # images have no rate
-    assert advice(150, 400) == ["ingest.max_frames=300", "ingest.overlap=16"]
+
+def test_each_frame_has_the_psnr_of_its_last_steps(run: FinishedRun) -> None:
+    rows = load_rows(run.folder, linked_manifests(run.folder, run.dag.names))
+    # Step k of the last training shows frame k % 5 at 20 + 0.05 k dB; every third one is on a repair.
+    steps = [[k for k in range(90) if k % 5 == frame and k % 3][-3:] for frame in range(5)]
+    expected = [20.0 + 0.05 * of_frame[1] for of_frame in steps]
+    assert [row.psnr for row in rows[:5]] == pytest.approx(expected)
+    assert rows[5].psnr is None, "no training used it"
+
+
+def test_held_out_frames_have_a_psnr_too(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path, held_out=(0, 3))
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+    data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])
+    assert all(frame["psnr"] > 5 for frame in data["frames"] if frame["role"] == "held out")
+    assert "2 frames that were held out" in text
+
+
+def test_what_moves_in_a_frame_is_a_layer(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    cells = np.arange(32) % 8 < 4  # the left half of 4 rows of 8 cells
+    moves = {"frame_id": [2], "rows": [4], "columns": [8], "moves": [np.packbits(cells).tobytes()]}
+    pq.write_table(pa.table(moves), run.folder / "consolidate/movement.parquet")
+    row = load_rows(run.folder, linked_manifests(run.folder, run.dag.names))[2]
+    layers = layers_of(row, run.folder)
+    change = np.abs(layers["moving"].astype(int) - layers["observed"]).max(axis=2)
+    assert (change[:, 48:] <= 1).all() and (change[:, :48] > 10).mean() > 0.9
+
+
+def test_the_command_writes_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = FinishedRun(tmp_path).folder
+    assert invoke(["report", str(run), "-o", str(tmp_path / "a.html")]) == 2
+    assert "--single-file" in capsys.readouterr().err and not (tmp_path / "a.html").exists()
+    assert invoke(["report", str(run), "-q", "--single-file"]) == 0
+    file = run / "run-report.html"
+    assert f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)" in capsys.readouterr().out
+    assert (run / "report.html").is_file()
+    assert invoke(["report", str(run), "--single-file", "--json", "-o", str(tmp_path / "a.html")]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["bytes"] == (tmp_path / "a.html").stat().st_size

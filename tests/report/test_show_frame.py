@@ -43,14 +43,12 @@ def test_a_frame_in_words_fits_100_columns(
     assert "frame 2 file clip.mp4#2" in words and "time 0.07 s" in words
     assert "pose camera at (-0.200, 0.060, " in words
     assert "role geometric, weight 0.40: B > 0.6, adds views" not in words  # R 0.8 and B 0.1 pass
-    assert "R 0.80 reliability, B 0.10 risk of degradation, G 0.30 geometric utility" in words
-    assert "motion blur 0.70, defocus 0.20" in words and "worst cue motion blur 0.70" in words
+    assert "R 0.80, B 0.10, G 0.30" in words and "worst cue motion blur 0.70" in words
     assert "motion blur, explains 62 % of the misfit" in words
     assert "blur 3.25 px, rolling shutter 0.00 px" in words
     assert "weight 0.40 before image formation, 0.75 after it" in words
     assert "round 1 the restored frame (primary score)" in words
     assert "sharp-1: render 80.0, restored 87.0, observed 75.0" in words
-    assert "restored from the frame as filmed: blur 4.0 px, skew 0.3 px" in words
     assert "final scene trained on the restored frame of round 1" in words
     assert f"written: {run}/two.png" in words
 
@@ -106,6 +104,6 @@ def test_brackets_in_names_are_no_markup(
     rows = read_table(path, FRAMES).to_pylist()
     rows[0]["name"], rows[1]["name"] = "a[blue]b.jpg", "c[/front].jpg"
     write_table(path, pa.Table.from_pylist(rows, FRAMES), FRAMES)
-    assert invoke(["show", str(run), "ingest", "--rows", "99"]) == 0
-    words = capsys.readouterr().out
-    assert "a[blue]b" in words and "c[/front]" in words
+    for row, name in zip(rows, ("a[blue]b", "c[/front]"), strict=False):
+        assert invoke(["show", str(run), "--frame", str(row["frame_id"])]) == 0
+        assert name in capsys.readouterr().out

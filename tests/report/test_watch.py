@@ -64,10 +64,10 @@ def test_a_finished_run_is_its_report(finished: FinishedRun, port: int) -> None:
     page = ask(port, "/report/")
     assert page.status == 200 and page.headers["content-type"] == "text/html"
     assert page.body == (finished.folder / "report/index.html").read_bytes()
-    for name in ("viewer.js", "report.json", "after.jpg"):
+    for name in ("viewer.js", "report.json", "scene.jpg"):
         found = ask(port, f"/report/{name}")
         assert found.status == 200 and found.body == (finished.folder / "report" / name).read_bytes()
-    assert ask(port, "/report/after.jpg").headers["content-type"] == "image/jpeg"
+    assert ask(port, "/report/scene.jpg").headers["content-type"] == "image/jpeg"
     assert ask(port, "/report/none.jpg").status == ask(port, "/report/frames").status == 404
     assert json.loads(ask(port, "/state.json").body)["done"] is True
 

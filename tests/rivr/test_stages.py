@@ -89,7 +89,13 @@ def digests(folder: Path) -> dict[str, str]:
 def same_scene(a: Path, b: Path) -> bool:
     return all(
         (a / name).read_bytes() == (b / name).read_bytes()
-        for name in ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors")
+        for name in (
+            "scene.ply",
+            "exposure.parquet",
+            "formation.parquet",
+            "movement.parquet",
+            "state.safetensors",
+        )
     )
 
 

@@ -16,6 +16,7 @@ from cleargs.capture.tables import FRAMES
 from cleargs.files import write_json
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, write_exposure
+from cleargs.formation.movement import write_movement
 from cleargs.formation.table import write_formation
 from cleargs.media.image import write_mask, write_rgb
 from cleargs.parquet import write_table
@@ -179,6 +180,7 @@ def write_capture(root: Path) -> None:
     write_ply(g0 / "scene.ply", Scene(disturbed))
     write_exposure(g0 / "exposure.parquet", Exposure.identity([0, 2, 3, 4, 5, 6]))
     write_formation(g0 / "formation.parquet", CaptureFormation([], FormationConfig()), {})
+    write_movement(g0 / "movement.parquet", {})
     save_state(g0 / "state.safetensors", Moments.zeros(disturbed).state())
     write_json(g0 / "manifest.json", {})
 

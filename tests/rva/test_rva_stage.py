@@ -86,6 +86,7 @@ def ingest_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = (frames * 3 + np.tile(np.arange(10), 8)).astype(np.int64)
     observations = pa.table({"frame_id": frames, "point_id": points}, schema=ingest.OBSERVATIONS)
     write_table(folder / "observations.parquet", observations, ingest.OBSERVATIONS)
+    write_table(folder / "points.parquet", ingest.POINTS.empty_table(), ingest.POINTS)
     return folder
 
 

@@ -183,6 +183,7 @@ def make_ingest(folder: Path) -> None:
         schema=ingest.OBSERVATIONS,
     )
     write_table(folder / "observations.parquet", seen, ingest.OBSERVATIONS)
+    write_table(folder / "points.parquet", ingest.POINTS.empty_table(), ingest.POINTS)
 
 
 class PreparedConfig(BaseModel):
@@ -200,7 +201,7 @@ class PreparedIngest:
     VERSION: int = 1
     CONFIG: type[BaseModel] = PreparedConfig
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    OUTPUTS: tuple[str, ...] = ("frames.parquet", "observations.parquet", "images")
+    OUTPUTS: tuple[str, ...] = ("frames.parquet", "points.parquet", "observations.parquet", "images")
     LEFTOVERS: tuple[str, ...] = ()
     SETTINGS: tuple[str, ...] = ()
     LIBRARIES: tuple[str, ...] = ()

@@ -46,6 +46,6 @@ def test_the_device_is_part_of_the_key(stage: str) -> None:
         externals={},
         seed=0,
         device="cpu",
-        libraries=library_versions(module, "cpu"),
+        libraries=library_versions(module, "cpu", module.CONFIG()),
     )
     assert parts.key != parts.model_copy(update={"device": "cuda"}).key

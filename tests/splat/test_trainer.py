@@ -104,6 +104,20 @@ def test_training_reduces_the_error(pictures: list[np.ndarray], tmp_path: Path) 
     assert set(rows.column("frame_id").to_pylist()) == set(range(6))
 
 
+def test_what_was_filmed_becomes_opaque(tmp_path: Path) -> None:
+    """Black behind the scene explains a dark photograph as well as an opaque Gaussian does."""
+    dark = [np.full((HEIGHT, WIDTH, 3), 40, np.uint8)] * 6
+    config = CONFIG.model_copy(update={"steps": 200, "refine_every": 5 / 200})
+    config = config.model_copy(update={"opacity_reg": 0.0})
+    alphas = []
+    for name, background in (("random", None), ("black", (0.0, 0.0, 0.0))):
+        trained = run(dark, tmp_path / name, config.model_copy(update={"background": background}))
+        assert trained.scene.background == (0.0, 0.0, 0.0)
+        shown = [render(trained.scene.gaussians, view.camera).alpha for view in views(dark)]
+        alphas.append(float(torch.stack(shown).mean()))
+    assert alphas[0] > 0.99 and alphas[1] < 0.9  # measured: 0.999 and 0.837
+
+
 def test_a_schedule_in_parts_equals_the_whole(pictures: list[np.ndarray], tmp_path: Path) -> None:
     """Rates, growth, SH degree, image size, noise and steps of Adam continue from the part before."""
     one = views(pictures[:1])  # each part has a different order of views
@@ -209,9 +223,9 @@ def looking(scene: Scene, pictures: list[np.ndarray]) -> Trainer:
 def test_errors_go_to_the_gaussians_that_cause_them(pictures: list[np.ndarray]) -> None:
     """One Gaussian of the true scene has the wrong colour, and a rate of 0."""
     wrong = gaussians()
-    still = LOOKING.model_copy(
-        update={f"lr_{name}": 0.0 for name in ("means", "scales", "rotations", "opacities", "sh")}
-    )
+    rates = dict.fromkeys(("lr_means", "lr_scales", "lr_rotations", "lr_opacities", "lr_sh"), 0.0)
+    # The pictures show transparent blobs over black.
+    still = LOOKING.model_copy(update={**rates, "background": (0.0, 0.0, 0.0)})
 
     def charged(scene: Gaussians) -> np.ndarray:
         trainer = Trainer(Scene(scene), views(pictures), still, seed=(1,))
@@ -427,6 +441,16 @@ def test_the_initial_scene_is_not_changed(pictures: list[np.ndarray], tmp_path: 
 def test_nan_errors_name_step_and_parameter(pictures: list[np.ndarray], tmp_path: Path) -> None:
     with pytest.raises(StageError, match=r"log_scales.* step \d+"):
         run(pictures, tmp_path, CONFIG.model_copy(update={"lr_scales": math.inf}))
+
+
+def test_a_finished_state_leaves_the_parameters_to_the_scene(
+    pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    done = run(pictures, tmp_path)
+    save_state(tmp_path / "finished.safetensors", done.state)
+    assert not any(name.startswith("parameter.") for name in done.state)
+    moments = read_moments(tmp_path / "finished.safetensors", done.scene.gaussians)
+    assert moments.first["means"].abs().max() > 0
 
 
 def poison(monkeypatch: pytest.MonkeyPatch, after: int, change: Callable[[Trainer], None]) -> None:

@@ -14,12 +14,13 @@ from cleargs.progress import SilentReporter
 from cleargs.rva.geometry import cumulative_motion, cut_into_bins
 from cleargs.stages.rva import RvaConfig
 from cleargs.synth.image_motion import track_motion
+from cleargs.synth.movers import Balloon
 from cleargs.synth.optics import Shutter
 from cleargs.synth.path import FPS, HandheldPath, frame_times
 from cleargs.synth.phone import LAG_S, METERING_SHARE, Look, auto_exposure, encode_and_decode, phone_look
 from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, plan_faults
 from cleargs.synth.raycast import RoomWorld, room_setup
-from cleargs.synth.room import Balloon, make_room
+from cleargs.synth.room import make_room
 from cleargs.synth.synthetic_capture import make_capture
 
 WIDTH, HEIGHT, SEED = 96, 54, 3

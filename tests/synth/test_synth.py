@@ -149,7 +149,7 @@ def test_paths_of_a_tremor_are_bent_and_stored(captures: dict[str, Path]) -> Non
             )
         return shares
 
-    # Of seeds 0 to 3 the means are at most 0.72 and at least 0.93 (docs/measuring.md).
+    # With seeds 0 to 3 the means are at most 0.72 and at least 0.93 (docs/measuring.md).
     assert np.mean(chords("tremor")) < 0.8 < 0.9 < np.mean(chords("gs2e-medium"))
 
 

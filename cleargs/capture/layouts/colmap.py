@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, SourceFrame
@@ -18,6 +19,8 @@ from cleargs.capture.folders import (
     mask_externals,
     require_most,
 )
+from cleargs.capture.layouts import llff
+from cleargs.capture.layouts.llff import POSES_BOUNDS
 from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, open_regular, read_text
 
@@ -35,6 +38,8 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
             images["beside_sparse"] = {path.name: path for path in image_files(source)}
         else:
             images[folder.name] = folder
+    if llff.detect(source, poses=True):
+        images["poses_bounds"] = source / POSES_BOUNDS
     return {**images, **mask_externals(source), "sparse": _largest(source)}
 
 
@@ -52,9 +57,16 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
             hint="put them into images/ and export the model again, or set ingest.poses=sfm",
         )
     root, paths, by_stem = find_images(source, list(posed))
+    missing = [name for name in posed if name not in paths]
+    if 2 * len(missing) > len(posed) and llff.detect(source, poses=True):
+        capture = llff.open_capture(source, config)
+        note = (
+            f"{len(missing)} of {len(posed)} images of the COLMAP model are missing: {POSES_BOUNDS} is read"
+        )
+        return replace(capture, notes=(*capture.notes, note))
     if not paths and not folders_to_search(source):
         raise InputError(f"{source} has a sparse model but no images/", hint="put the images into images/")
-    notes = list(require_most([name for name in posed if name not in paths], len(posed), "the COLMAP model"))
+    notes = list(require_most(missing, len(posed), "the COLMAP model"))
     if len(models) > 1:
         notes.append(
             f"{len(models)} sparse models: {folder.relative_to(source)} is read, which has the most images "

@@ -49,20 +49,18 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
 def read_llff(root: Path) -> list[SourceFrame]:
     """Return the images of ``root`` with their cameras, in the order of the rows.
 
-    Row i belongs to image i by sorted file name (not natural order). LLFF writes the file so, and all its
-    readers count test views so. The images are those of ``images/``, else of the largest ``images_N/`` that
-    has as many images as there are rows, because some releases keep test views in only one folder.
+    Row i belongs to image i by sorted file name (not natural order), as in LLFF. The images are those of the
+    first of ``images/`` and ``images_N/`` with as many as there are rows: some releases keep test views in
+    only one folder.
 
     Raises:
         InputError: a damaged file, a number of rows that fits no folder, NaN, or cameras that no lens has.
     """
     table = read_poses_bounds(root / POSES_BOUNDS)
-    folders = {
-        folder: sorted(image_files(folder), key=lambda path: path.name) for folder in image_folders(root)
-    }
+    folders = {folder.name: sorted(image_files(folder)) for folder in image_folders(root)}
     paths = next((files for files in folders.values() if len(files) == len(table)), None)
     if paths is None:
-        counts = ", ".join(f"{folder.name}/ {len(files)}" for folder, files in folders.items())
+        counts = ", ".join(f"{name}/ {len(files)}" for name, files in folders.items())
         raise InputError(
             f"{POSES_BOUNDS} has {len(table)} poses, which is not the number of images "
             f"({counts or 'no images/ there'})",

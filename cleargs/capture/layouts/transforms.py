@@ -71,12 +71,11 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     notes: list[str] = []
     frames: list[SourceFrame] = []
     for file in files:
-        test = file.name != _LISTING and file != files[0]
         listed = read_transforms(file, poses=config.poses == "auto", notes=notes)
-        frames += [replace(frame, test=test) for frame in listed]
-    unread = [file.name for file in _split_files(source) if files[0].name != _LISTING and file not in files]
-    if unread:
-        notes.append(f"{', '.join(unread)} is not read: the test views are those of {files[-1].name}")
+        frames += [replace(frame, test=file != files[0]) for frame in listed]
+    split = _split_files(source)
+    if files == split[:2] and len(split) > 2:
+        notes.append(f"{split[2].name} is not read: the test views are those of {split[1].name}")
     frames.sort(key=lambda frame: frame_key(frame.name))
     names = [name_below_images(frame.name) for frame in frames]
     taken = chosen(frames, source, config.max_frames, names)
@@ -109,13 +108,9 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
     """
     common, entries = _read_listing(path)
     missing = [entry.values["file_path"] for entry in entries if entry.image is None]
-    if missing and notes is None:
-        raise InputError(
-            f"{path.name} lists images that do not exist: {', '.join(missing[:3])}",
-            hint="put the images where file_path says, or remove the entries",
-        )
+    lost = require_most(missing, len(entries) if notes is not None else 0, path.name)
     if notes is not None:
-        notes += require_most(missing, len(entries), path.name)
+        notes += lost
     frames = []
     for entry in entries:
         if entry.image is None:
@@ -189,10 +184,10 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
         raise InputError(f"{name} has no pose (transform_matrix)", hint=hint)
     try:
         matrix = np.array(entry["transform_matrix"], np.float64)
+        if matrix.shape not in ((4, 4), (3, 4)):
+            raise ValueError
     except FAULTS as error:
-        raise InputError(f"the pose of {name} is not a matrix of numbers", hint=hint) from error
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise InputError(f"the pose of {name} is not a 4x4 matrix", hint=hint)
+        raise InputError(f"the pose of {name} is not a 4x4 matrix of numbers", hint=hint) from error
     return rigid_pose(matrix, name, hint)
 
 

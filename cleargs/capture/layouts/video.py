@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,26 +47,20 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         )
     frames: list[SourceFrame] = []
     shares = _shares(timelines, config.max_frames)
+    stems = Counter(video.stem for video in videos)
     for video, timeline, at_most in zip(videos, timelines, shares, strict=True):
         if timeline.pts and at_most:
-            name = frame_prefix(video, videos)
+            name = video.stem if stems[video.stem] == 1 else video.name
             chosen = choose_times(timeline, config.fps, at_most)
             frames += [video_frame(video, timeline, index, name) for index in chosen]
-    hdr = next((timeline.transfer for timeline in whole if timeline.transfer), None)
-    available = sum(len(timeline.pts) for timeline in timelines)
     return Capture(
         "video",
         tuple(frames),
-        available,
-        hdr=hdr,
+        sum(len(timeline.pts) for timeline in timelines),
+        hdr=next((timeline.transfer for timeline in whole if timeline.transfer), None),
         stretch=(config.start, config.end),
         notes=tuple(_notes(videos, whole)),
     )
-
-
-def frame_prefix(video: Path, videos: Sequence[Path]) -> str:
-    """Return the start of the names of its frames: its stem, or its name where another has that stem."""
-    return video.stem if sum(other.stem == video.stem for other in videos) == 1 else video.name
 
 
 def video_frame(source: Path, timeline: Timeline, index: int, prefix: str) -> SourceFrame:
@@ -84,11 +79,8 @@ def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[in
     times = np.array([timeline.seconds(index) for index in range(len(timeline.pts))])
     times -= times[0]
     span = float(times[-1])
-    chosen = (
-        list(range(len(times)))
-        if fps is None
-        else _nearest(times, np.arange(int(span * fps + 1e-6) + 1) / fps)
-    )
+    wanted = times if fps is None else np.arange(int(span * fps + 1e-6) + 1) / fps
+    chosen = _nearest(times, wanted)
     return chosen if len(chosen) <= at_most else _nearest(times, np.linspace(0, span, at_most))
 
 

@@ -27,7 +27,7 @@ const pairs = (title, entries) => {
 const fillChoice = (choice, frame, wanted, fallback) => {
   const names = Object.keys(frame.layers);
   choice.replaceChildren(...names.map((name) => {
-    const label = report.layers[name] + (name === frame.chosen ? " (chosen)" : "");
+    const label = report.layers[name] + (name === frame.chosen ? " (repair)" : "");
     return Object.assign(make("option", label), { value: name });
   }));
   choice.value = names.includes(wanted) ? wanted : fallback;
@@ -36,7 +36,7 @@ const fillChoice = (choice, frame, wanted, fallback) => {
 const showLayers = (frame) => {
   for (const [side, choice, picture] of [["left", leftChoice, leftPicture], ["right", rightChoice, rightPicture]]) {
     const label = report.layers[choice.value];
-    picture.src = frame.layers[choice.value];
+    picture.src = asset(frame.layers[choice.value]);
     picture.alt = `${describe(frame).view}: ${label}`;
     one(`#tag-${side}`).textContent = label;
   }
@@ -48,8 +48,8 @@ const fillContact = (frame) => {
   one("#contact").replaceChildren(...Object.entries(frame.layers).map(([name, path]) => {
     const button = Object.assign(make("button"), { type: "button" });
     button.setAttribute("aria-pressed", String(name === rightChoice.value));
-    const label = report.layers[name] + (name === frame.chosen ? " (chosen)" : "");
-    button.append(Object.assign(make("img"), { src: path, alt: "" }), label);
+    const label = report.layers[name] + (name === frame.chosen ? " (repair)" : "");
+    button.append(Object.assign(make("img"), { src: asset(path), alt: "", loading: "lazy" }), label);
     if (frame.notes?.[name]) button.append(make("small", frame.notes[name]));
     button.addEventListener("click", () => choose("right", name));
     return button;
@@ -79,7 +79,8 @@ const inspect = (index) => {
 
 const indexOf = (id) => report.frames.findIndex((frame) => frame.id === Number(id));
 for (const opener of all("[data-opens]")) {
-  opener.addEventListener("click", () => {
+  opener.addEventListener("click", (event) => {
+    event.preventDefault();
     if (opener.dataset.layer) chosenLayers.right = opener.dataset.layer;
     inspect(indexOf(opener.dataset.opens));
   });

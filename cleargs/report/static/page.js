@@ -1,4 +1,4 @@
-// Functions of all pages: buttons that copy text, and filters of a list.
+// Functions of all pages: addresses of images, buttons that copy text, filters of a list, and printing.
 "use strict";
 const one = (selector, root = document) => root.querySelector(selector);
 const all = (selector, root = document) => [...root.querySelectorAll(selector)];
@@ -9,6 +9,9 @@ const make = (tag, text, className) => {
   if (className) element.className = className;
   return element;
 };
+
+// Address of an image of the page. A report in one file contains its images.
+const asset = (path) => window.files?.[path] ?? path;
 
 // -- copying ------------------------------------------------------------------------------------------------
 const copy = async (text) => {
@@ -38,3 +41,11 @@ for (const pill of all("#filters button")) {
     for (const item of all("#strip li")) item.hidden = pill.dataset.kind !== "" && item.dataset.kind !== pill.dataset.kind;
   });
 }
+
+// -- printing: folded parts are printed too ------------------------------------------------------------------
+addEventListener("beforeprint", () => {
+  for (const folded of all("details:not([open])")) { folded.open = true; folded.dataset.folds = ""; }
+});
+addEventListener("afterprint", () => {
+  for (const folded of all("[data-folds]")) { folded.open = false; delete folded.dataset.folds; }
+});

@@ -1,77 +1,76 @@
-// The two scenes in 3D. The viewer and the scenes are scripts, since a page that is opened from disk may not read files.
-// The user controls the second viewer. The first viewer copies its camera in every frame.
+// The final scene in 3D, next to a frame as filmed. The viewer and the scene are scripts, since a page that is opened
+// from disk may not read files.
 "use strict";
 {
   const stage = one("#stage");
   const status = one("#status");
-  const { settings, scenes, start } = report.viewer;
-  const panes = Object.fromEntries(all(".pane").map((pane) => [pane.dataset.scene, pane]));
-  let before = null;
-  let after = null;
+  const pane = one('[data-pane="scene"]');
+  const { settings, antialias, step, rotations } = report.viewer;
+  let viewer = null;
+  let wanted = report.frames[timeline.index()].time ?? 0;
 
   const loadScript = (name) => new Promise((resolve, reject) => {
+    if (window.packed?.[name]) { resolve(); return; } // the report is one file
     const script = Object.assign(document.createElement("script"), { src: `${name}.js`, onload: resolve });
     script.onerror = () => reject(new Error(`${name}.js is missing`));
     document.head.append(script);
   });
 
   // Loads a script that contains gzipped content in base64, and returns a URL of the content.
-  const unpack = async (name, file, type) => {
-    await loadScript(file);
+  const unpack = async (name, type) => {
+    await loadScript(name);
     const bytes = Uint8Array.from(atob(window.packed[name]), (letter) => letter.charCodeAt(0));
     delete window.packed[name];
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
     return URL.createObjectURL(new Blob([await new Response(stream).arrayBuffer()], { type }));
   };
 
-  const cameraOf = (viewer) => viewer.app.root.findByName("camera");
-
-  const loaded = (viewer) => new Promise((resolve) => {
-    if (viewer.state.loaded) resolve();
-    else viewer.events.once("loaded:changed", resolve);
-  });
-
-  const open = async (module, scene) => {
-    const url = await unpack(scene.key, `scene-${scene.key}`, "application/octet-stream");
-    const viewer = await module.createViewer({
-      container: one(".live", panes[scene.key]),
+  const open = async () => {
+    const module = await import(await unpack("viewer", "text/javascript"));
+    const url = await unpack("scene", "application/octet-stream");
+    const save = one("#save");
+    save.hidden = false;
+    save.addEventListener("click", () => Object.assign(make("a"), { href: url, download: save.dataset.name }).click());
+    const opened = await module.createViewer({
+      container: one(".live", pane),
       settings,
       contentUrl: url,
       contentFilename: "scene.compressed.ply",
       renderer: new URLSearchParams(location.search).has("webgpu") ? "webgpu" : "webgl",
       ui: false,
       noanim: true,
-      aa: scene.antialias,
+      aa: antialias,
     });
-    viewer.state.inputEnabled = false; // the page uses the keyboard until the stage has the focus
-    await loaded(viewer);
-    viewer.seek(start);
-    viewer.app.once("frameend", () => panes[scene.key].classList.add("ready"));
-    viewer.app.renderNextFrame = true;
-    return viewer;
+    opened.state.inputEnabled = false; // the page uses the keyboard until the stage has the focus
+    if (!opened.state.loaded) await new Promise((resolve) => opened.events.once("loaded:changed", resolve));
+    return opened;
   };
 
-  const follow = () => {
-    const [from, to] = [cameraOf(after), cameraOf(before)];
-    before.app.on("update", () => {
-      to.setPosition(from.getPosition());
-      to.setRotation(from.getRotation());
-      for (const name of ["fov", "nearClip", "farClip"]) to.camera[name] = from.camera[name];
+  // The viewer keeps the horizon level. At a frame, and between frames, the camera has the rotation of the frames.
+  const tilt = () => {
+    const camera = viewer.app.root.findByName("camera");
+    const [from, to] = [0, 1].map(() => camera.getRotation().clone());
+    viewer.app.on("update", () => {
+      if ("away" in stage.dataset) return;
+      const at = wanted / step;
+      from.set(...rotations[Math.floor(at)]);
+      to.set(...rotations[Math.min(Math.ceil(at), rotations.length - 1)]);
+      camera.setRotation(from.slerp(from, to, at % 1));
     });
   };
 
   const begin = async () => {
     try {
-      const module = await import(await unpack("viewer", "viewer", "text/javascript"));
-      after = await open(module, scenes[1]);
-      before = await open(module, scenes[0]);
-      follow();
+      viewer = await open();
+      tilt();
+      goTo(wanted);
+      viewer.app.once("frameend", () => pane.classList.add("ready"));
       status.textContent = "";
     } catch (error) {
-      status.textContent = "3D is not available in this browser. These are still images.";
+      status.textContent = "3D is not available in this browser. This is a still image.";
       console.warn(error);
     }
-    document.documentElement.dataset.stage = after && before ? "ready" : "failed";
+    document.documentElement.dataset.stage = viewer ? "ready" : "failed";
   };
   new IntersectionObserver((entries, observer) => {
     if (!entries.some((entry) => entry.isIntersecting)) return;
@@ -79,18 +78,16 @@
     begin();
   }, { rootMargin: "200px" }).observe(stage);
 
-  // -- input: events on the left viewer are sent to the right viewer ---------------------------------------
-  for (const type of ["pointerdown", "wheel", "contextmenu"]) {
-    panes.before.addEventListener(type, (event) => {
-      if (!after) return;
-      event.preventDefault();
-      event.stopPropagation();
-      after.app.graphicsDevice.canvas.dispatchEvent(new event.constructor(type, event));
-    }, { capture: true, passive: false });
-  }
-  stage.addEventListener("focusin", () => { if (after) after.state.inputEnabled = true; });
-  stage.addEventListener("focusout", () => { if (after) after.state.inputEnabled = false; });
-  stage.addEventListener("pointerdown", () => stage.focus({ preventScroll: true }));
+  // -- input ------------------------------------------------------------------------------------------------
+  stage.addEventListener("focusin", () => { if (viewer) viewer.state.inputEnabled = true; });
+  stage.addEventListener("focusout", () => { if (viewer) viewer.state.inputEnabled = false; });
+  stage.addEventListener("pointerdown", (event) => {
+    if (event.target.id !== "wipe") stage.focus({ preventScroll: true });
+  });
+  // The frame as filmed belongs to its own camera only.
+  const leave = () => { stop(); stage.dataset.away = ""; };
+  for (const type of ["pointerdown", "wheel"]) pane.addEventListener(type, leave, { passive: true });
+  stage.addEventListener("keydown", (event) => { if ("wasdqef".includes(event.key.toLowerCase())) leave(); });
 
   const setMode = (mode) => {
     stage.dataset.mode = mode;
@@ -100,50 +97,54 @@
   one("#wipe").addEventListener("input", (event) => stage.style.setProperty("--wipe", `${event.target.value}%`));
   if (matchMedia("(max-width: 44rem)").matches) setMode("wipe");
 
-  // -- the camera -----------------------------------------------------------------------------------------
-  const playing = () => after.state.cameraMode === "anim" && !after.state.animationPaused;
+  // -- the camera -------------------------------------------------------------------------------------------
   const play = one('[data-act="play"]');
+  let flight = 0; // request of the next picture of a flight along the path
+
+  const stop = () => {
+    cancelAnimationFrame(flight);
+    flight = 0;
+    play.setAttribute("aria-pressed", "false");
+  };
+
+  const seek = (time) => {
+    wanted = time;
+    delete stage.dataset.away;
+    if (!viewer) return;
+    viewer.state.animationPaused = true;
+    viewer.seek(time); // and renders
+  };
+
+  const goTo = (time) => { stop(); seek(time); };
+
+  const placed = report.frames.filter((frame) => frame.time !== null);
+  const fly = () => {
+    const end = step * (placed.length - 1);
+    const origin = (wanted >= end ? 0 : wanted) - performance.now() / 1000;
+    const next = () => {
+      const time = origin + performance.now() / 1000;
+      if (time >= end) { stop(); return; }
+      seek(time);
+      timeline.select(report.frames.indexOf(placed[Math.round(time / step)]), false);
+      flight = requestAnimationFrame(next);
+    };
+    play.setAttribute("aria-pressed", "true");
+    flight = requestAnimationFrame(next);
+  };
+
   const act = {
-    play: () => {
-      const on = !playing();
-      if (on) after.state.cameraMode = "anim";
-      after.state.animationPaused = !on;
-      play.setAttribute("aria-pressed", String(on));
-    },
-    start: () => goTo(start),
-    all: () => after.frameScene(),
+    play: () => (flight ? stop() : fly()),
+    back: () => timeline.select(timeline.index()),
+    all: () => { leave(); viewer.frameScene(); },
     full: () => (document.fullscreenElement ? document.exitFullscreen() : stage.requestFullscreen()),
   };
   for (const button of all("#controls [data-act]")) {
-    button.addEventListener("click", () => { if (after) act[button.dataset.act](); });
+    button.addEventListener("click", () => { if (viewer) act[button.dataset.act](); });
   }
-
-  const goTo = (time) => {
-    if (!after) return;
-    after.state.animationPaused = true;
-    play.setAttribute("aria-pressed", "false");
-    after.seek(time);
-  };
-
-  const marks = all(".mark");
-  const showFrame = (id) => {
-    const frame = report.frames[indexOf(id)];
-    if (frame.time === null) return;
-    for (const mark of marks) mark.classList.toggle("here", mark.dataset.frame === String(id));
-    goTo(frame.time);
-  };
-  marks.forEach((mark, index) => {
-    mark.addEventListener("click", () => showFrame(mark.dataset.frame));
-    mark.addEventListener("keydown", (event) => {
-      if (event.key === "Enter" || event.key === " ") { event.preventDefault(); showFrame(mark.dataset.frame); }
-      const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-      if (step) { event.preventDefault(); marks[(index + step + marks.length) % marks.length].focus(); }
-    });
-  });
   one("#stand").addEventListener("click", () => {
     inspector.close();
-    showFrame(report.frames[current].id);
+    timeline.select(current);
     stage.scrollIntoView({ block: "center" });
   });
-  window.reportStage = { get before() { return before; }, get after() { return after; } };
+  window.reportStage = { goTo, get viewer() { return viewer; } };
 }

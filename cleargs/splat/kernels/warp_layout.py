@@ -28,15 +28,22 @@ CY = 3
 MEDIAN = 4  # median depth, scene units
 DISC = 5  # radius of the defocus disc per unit of nearness
 FOCUS = 6  # nearness that is in focus
-TWISTS = 7  # pose, blur and skew: translation and rotation, six numbers each
-MOTION_COLUMNS = 25
+TWISTS = 7  # pose, blur, skew, bend and cube: translation and rotation, six numbers each
+CURVES = 25  # the first number of bend; all are zero on a straight path
+MOTION_COLUMNS = 37
+
+BEND_REACH = 1.0 / 6.0
+CUBE_REACH = 1.0 / 20.0
+"""Largest absolute values, for t from -1/2 to 1/2, of t^2 - 1/12 and t^3 - 3t/20."""
 
 
 class DisplacementFields(NamedTuple):
     """Displacements of an observed image's pixels in px, x before y; ``frame_warp`` has the formula."""
 
     offset: Tensor  # [2, H, W] at the middle of the exposure
-    sweep: Tensor  # [2, H, W] over the exposure
+    sweep: Tensor  # [2, H, W] over the exposure, by the part of the path that is linear in time
     radius: Tensor  # [H, W] of the defocus disc
     reach: float | None = None
     """Largest vertical displacement, px; None if it is unknown."""
+    curve: Tensor | None = None  # [4, H, W] bend, then cube
+    """Parts of the path of second and third order in time; None for straight paths."""

@@ -29,7 +29,7 @@ class Vignette:
         mask: Tensor | None,
         render: Renderer,
     ) -> "VignettedView":
-        return VignettedView(self, view.camera.scaled(factor), view.weight)
+        return VignettedView(self, view.camera.scaled(factor), view.weight, mask)
 
     def digest(self) -> str:
         return f"vignette {self.strength} {self.rate}"
@@ -51,6 +51,7 @@ class VignettedView:
     vignette: Vignette
     camera: Camera
     weight: float
+    mask: Tensor | None
     needs_depth: bool = False
 
     def forward(self, render: Render) -> Tensor:

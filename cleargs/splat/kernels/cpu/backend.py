@@ -18,10 +18,16 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import blur_sums as blur_kernels
-from cleargs.splat.kernels.cpu import elementwise, frame_warp, loss
+from cleargs.splat.kernels.cpu import elementwise, frame_search, frame_warp, loss
 from cleargs.splat.kernels.cpu.jit import LAUNCHING
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
-from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
+from cleargs.splat.kernels.warp_layout import (
+    CHANNELS,
+    CURVE_STEPS,
+    CURVES,
+    MOTION_COLUMNS,
+    DisplacementFields,
+)
 from cleargs.splat.types import Moments, Rate
 from cleargs.types import AnyArray, ArrayF32
 
@@ -197,6 +203,7 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
     height, width = (side - 2 * margin for side in depth.shape)
     offset, sweep = torch.empty(2, height, width), torch.empty(2, height, width)
     radius, reach = torch.empty(height, width), np.empty(height)
+    curve = torch.empty(4, height, width) if motion[CURVES:].any() else None
     with LAUNCHING:
         frame_warp.displacements(
             _read(depth),
@@ -206,31 +213,37 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
             offset.numpy(),
             sweep.numpy(),
             radius.numpy(),
+            None if curve is None else curve.numpy(),
             reach,
         )
-    return DisplacementFields(offset, sweep, radius, float(reach.max()))
+    return DisplacementFields(offset, sweep, radius, float(reach.max()), curve)
 
 
 def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
-    offset, sweep, radius = map(_read, fields[:3])
-    light = torch.empty(*radius.shape, CHANNELS)
+    arrays = _arrays(fields)
+    light = torch.empty(*fields.radius.shape, CHANNELS)
     with LAUNCHING:
-        frame_warp.expose(_read(image), margin, offset, sweep, radius, _read(samples), light.numpy())
+        frame_warp.expose(_read(image), margin, *arrays, _read(samples), light.numpy())
     return light
 
 
 def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
-    offset, sweep, radius = map(_read, fields[:3])
-    height, width = radius.shape
+    height, width = fields.radius.shape
     image = torch.empty(height + 2 * margin, width + 2 * margin, CHANNELS)
     rows, columns, _ = image.shape
     reach = rows if fields.reach is None else min(math.ceil(fields.reach) + 3, rows)
     count = -(-height // frame_warp.BAND)
     bands = np.empty((count, frame_warp.BAND + 2 * reach, columns, CHANNELS), np.float32)
     with LAUNCHING:
-        frame_warp.spread(_read(light), margin, reach, offset, sweep, radius, _read(samples), bands, rows)
+        frame_warp.spread(_read(light), margin, reach, *_arrays(fields), _read(samples), bands, rows)
         frame_warp.gather(bands, margin, reach, image.numpy())
     return image
+
+
+def _arrays(fields: DisplacementFields) -> tuple[ArrayF32, ArrayF32, ArrayF32, ArrayF32 | None]:
+    """Return offset, sweep, radius and curve as the kernels read them."""
+    curve = None if fields.curve is None else _read(fields.curve)
+    return _read(fields.offset), _read(fields.sweep), _read(fields.radius), curve
 
 
 def through_curve(image: Tensor, curve: Tensor, channels: int) -> tuple[Tensor, Tensor]:
@@ -254,14 +267,17 @@ def misfit(
     image: ArrayF32,  # [H, W]
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
-    fields: tuple[ArrayF32, ArrayF32, ArrayF32],
+    fields: tuple[ArrayF32, ArrayF32, ArrayF32, ArrayF32 | None],
     samples: ArrayF32,  # [K, 3]
     limit: float,
 ) -> float:
-    """Return the sum over all rows of `frame_warp.misfits`; ``fields`` are offset, sweep and radius in px."""
+    """Return the sum over all rows of `frame_search.misfits`.
+
+    ``fields`` are offset, sweep, radius and curve in px.
+    """
     rows = np.empty(len(image))
     with LAUNCHING:
-        frame_warp.misfits(image, observed, weight, *fields, samples, limit, rows)
+        frame_search.misfits(image, observed, weight, *fields, samples, limit, rows)
     return math.fsum(rows)
 
 
@@ -273,16 +289,29 @@ def normal_equations(
     down: ArrayF32,  # [H]
     offset: ArrayF32,  # [2, H, W]
     sweep: ArrayF32,  # [2, H, W]
+    curve: ArrayF32 | None,  # [4, H, W]
     times: ArrayF32,  # [K]
     outlier: float,
     active: npt.NDArray[np.int64],  # [A]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the matrix [A, A] and right side [A] of the equations of `frame_warp.normal_equations`."""
+    """Return the matrix [A, A] and right side [A] of the equations of `frame_search.normal_equations`."""
     height, count = len(observed), len(active)
     matrices, sides = np.empty((height, count, count)), np.empty((height, count))
     with LAUNCHING:
-        frame_warp.normal_equations(
-            stack, observed, weight, basis, down, offset, sweep, times, outlier, active, matrices, sides
+        frame_search.normal_equations(
+            stack,
+            observed,
+            weight,
+            basis,
+            down,
+            offset,
+            sweep,
+            curve,
+            times,
+            outlier,
+            active,
+            matrices,
+            sides,
         )
     lower = matrices.sum(axis=0)
     return lower + np.tril(lower, -1).T, sides.sum(axis=0)
@@ -345,25 +374,28 @@ def warm_up() -> None:
 def _warm_up_formation() -> None:
     """Run the kernels of image formation and of the search for a frame's motion."""
     plane, colours = torch.ones(SIZE, SIZE), torch.zeros(SIZE, SIZE, CHANNELS)
-    curve, still = torch.zeros(CURVE_STEPS + 1), torch.ones(MOTION_COLUMNS)
-    _, slope = through_curve(colours, curve, CHANNELS)
+    _, slope = through_curve(colours, torch.zeros(CURVE_STEPS + 1), CHANNELS)
     times_slope(colours, slope, CHANNELS)
-    fields = displacements(plane, plane, still, margin=0)
-    light = expose(colours, fields, torch.zeros(1, 3), margin=0)
-    expose_backward(light, fields, torch.zeros(1, 3), margin=0)
     pixels = plane.numpy()
-    offset, sweep, radius = (field.numpy() for field in fields[:3])
-    misfit(pixels, pixels, pixels, (offset, sweep, radius), np.zeros((1, 3), np.float32), 1.0)
-    normal_equations(
-        np.zeros((SIZE, SIZE, 3), np.float32),
-        pixels,
-        pixels,
-        np.zeros((6, 2, SIZE, SIZE), np.float32),
-        np.zeros(SIZE, np.float32),
-        offset,
-        sweep,
-        np.zeros(1, np.float32),
-        1.0,
-        np.arange(6),
-    )
+    for last in (CURVES, MOTION_COLUMNS):  # straight and curved paths
+        still = torch.zeros(MOTION_COLUMNS)
+        still[:last] = 1.0
+        fields = displacements(plane, plane, still, margin=0)
+        light = expose(colours, fields, torch.zeros(1, 3), margin=0)
+        expose_backward(light, fields, torch.zeros(1, 3), margin=0)
+        offset, sweep, radius, curve = _arrays(fields)
+        misfit(pixels, pixels, pixels, (offset, sweep, radius, curve), np.zeros((1, 3), np.float32), 1.0)
+        normal_equations(
+            np.zeros((SIZE, SIZE, 3), np.float32),
+            pixels,
+            pixels,
+            np.zeros((6, 2, SIZE, SIZE), np.float32),
+            np.zeros(SIZE, np.float32),
+            offset,
+            sweep,
+            curve,
+            np.zeros(1, np.float32),
+            1.0,
+            np.arange(6),
+        )
     blur_sums(pixels, pixels, pixels, 2, 4)

@@ -2,9 +2,11 @@
 
 A pixel x of the observed image is the mean of the sharp image at
 
-    x + offset(x) + t sweep(x) + radius(x) (u, v)
+    x + offset(x) + t sweep(x) + (t^2 - 1/12) bend(x) + (t^3 - 3t/20) cube(x) + radius(x) (u, v)
 
-over ``samples`` (t, u, v): times t from -1/2 to 1/2 of the exposure, and points (u, v) of the unit disc.
+over ``samples`` (t, u, v): times t from -1/2 to 1/2 of the exposure, and points (u, v) of the unit disc. The
+polynomials are orthogonal over the exposure. ``curve`` [4, H, W] holds bend and cube. It is None where the
+paths are straight, for which Numba compiles the kernels without the terms.
 Fields are in pixels, [2, H, W] with x before y. The sharp image is larger than the observed image by
 ``margin`` pixels on every side. Beyond its border, the border pixels are repeated.
 
@@ -50,7 +52,7 @@ _HALF = np.float32(0.5)
 
 
 @inlined
-def _between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, float32
+def between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, float32
     """Return the first of the two pixels around ``position``, and the weight of the second."""
     inside = min(max(position, _ZERO), last)
     first = np.int32(min(inside, max(last - _ONE, _ZERO)))
@@ -58,12 +60,30 @@ def _between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, 
 
 
 @inlined
-def _inside(place: Any, sweep: Any, wide: Any, last: Any) -> Any:  # float32 -> bool
+def bow(t: Any) -> Any:
+    """Return the polynomial of second order at a time of the exposure."""
+    return t * t - np.float32(1.0 / 12.0)
+
+
+@inlined
+def ess(t: Any) -> Any:
+    """Return the polynomial of third order at a time of the exposure."""
+    return t * (t * t - np.float32(3.0 / 20.0))
+
+
+@inlined
+def _curved_reach(bend: Any, cube: Any) -> Any:  # float32 -> float32
+    """Return how far the curve leads a pixel from its straight path at most, px."""
+    return np.float32(layout.BEND_REACH) * abs(bend) + np.float32(layout.CUBE_REACH) * abs(cube)
+
+
+@inlined
+def _inside(place: Any, sweep: Any, wide: Any, curved: Any, last: Any) -> Any:  # float32 -> bool
     """Return True if all samples of a pixel are inside the image and not near its border; False for NaN.
 
     The point of a sample may be outside the unit disc by up to a tenth of its radius.
     """
-    far = _HALF * abs(sweep) + np.float32(1.1) * wide + _ONE
+    far = _HALF * abs(sweep) + np.float32(1.1) * wide + _ONE + curved
     return place - far >= _ZERO and place + far <= last
 
 
@@ -101,15 +121,24 @@ def _on_curve(curve: Any, value: Any) -> tuple[Any, Any]:  # [STEPS + 1], float3
     return curve[index] + (place - np.float32(index)) * rise, rise * steps
 
 
+@inlined
+def _flow(x: Any, y: Any, near: Any, tx: Any, ty: Any, tz: Any, rx: Any, ry: Any, rz: Any) -> tuple[Any, Any]:
+    """Return the displacement, in units of fx, of a pixel on the ray (x, y, 1) under a twist."""
+    along_x = near * (x * tz - tx) + x * y * rx - (_ONE + x * x) * ry + y * rz
+    along_y = near * (y * tz - ty) + (_ONE + y * y) * rx - x * y * ry - x * rz
+    return along_x, along_y
+
+
 @kernel
 def displacements(
     depth: ArrayF32,  # [H + 2 margin, W + 2 margin] accumulated
     alpha: ArrayF32,  # [H + 2 margin, W + 2 margin]
     margin: int,
-    motion: ArrayF32,  # [25]: see `warp_layout`
+    motion: ArrayF32,  # [37]: see `warp_layout`
     offset: ArrayF32,  # [2, H, W] written
     sweep: ArrayF32,  # [2, H, W] written
     radius: ArrayF32,  # [H, W] written
+    curve: ArrayF32 | None,  # [4, H, W] written
     reach: AnyArray,  # [H] float64, written: largest vertical displacement of a sample per row, px
 ) -> None:
     """Compute the displacement fields of a frame's motion and defocus.
@@ -120,7 +149,7 @@ def displacements(
     """
     _, height, width = offset.shape
     fx, fy, cx, cy = motion[layout.FX], motion[layout.FY], motion[layout.CX], motion[layout.CY]
-    twists = motion[layout.TWISTS :].reshape(3, 6)
+    twists = motion[layout.TWISTS :].reshape(5, 6)
     for row in prange(height):
         down = np.float32((row + 0.5) / height - 0.5)
         y = (np.float32(row) + np.float32(0.5) - cy) / fy
@@ -139,13 +168,20 @@ def displacements(
                 if part == 0:
                     tx, ty, tz = tx + down * twists[2, 0], ty + down * twists[2, 1], tz + down * twists[2, 2]
                     rx, ry, rz = rx + down * twists[2, 3], ry + down * twists[2, 4], rz + down * twists[2, 5]
-                along_x = near * (x * tz - tx) + x * y * rx - (_ONE + x * x) * ry + y * rz
-                along_y = near * (y * tz - ty) + (_ONE + y * y) * rx - x * y * ry - x * rz
                 field = offset if part == 0 else sweep
+                along_x, along_y = _flow(x, y, near, tx, ty, tz, rx, ry, rz)
                 field[0, row, column] = along_x
                 field[1, row, column] = along_y * (fy / fx)
             radius[row, column] = motion[layout.DISC] * abs(near - motion[layout.FOCUS])
             vertical = abs(offset[1, row, column]) + np.float32(0.5) * abs(sweep[1, row, column])
+            if curve is not None:
+                for part in range(2):
+                    tx, ty, tz = twists[3 + part, 0], twists[3 + part, 1], twists[3 + part, 2]
+                    rx, ry, rz = twists[3 + part, 3], twists[3 + part, 4], twists[3 + part, 5]
+                    along_x, along_y = _flow(x, y, near, tx, ty, tz, rx, ry, rz)
+                    curve[2 * part, row, column] = along_x
+                    curve[2 * part + 1, row, column] = along_y * (fy / fx)
+                vertical += _curved_reach(curve[1, row, column], curve[3, row, column])
             farthest = max(farthest, np.float64(vertical + radius[row, column]))
         reach[row] = farthest
 
@@ -173,6 +209,7 @@ def expose(
     offset: ArrayF32,  # [2, H, W]
     sweep: ArrayF32,  # [2, H, W]
     radius: ArrayF32,  # [H, W]
+    curve: ArrayF32 | None,  # [4, H, W]
     samples: ArrayF32,  # [K, 3] t, u, v
     out: ArrayF32,  # [H, W, 4] linear light, written
 ) -> None:
@@ -188,11 +225,26 @@ def expose(
             x0 = np.float32(x + margin) + offset[0, y, x]
             y0 = np.float32(y + margin) + offset[1, y, x]
             along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
-            if not cubic and _inside(x0, along_x, wide, right) and _inside(y0, along_y, wide, bottom):
+            curved_x, curved_y = _ZERO, _ZERO
+            if curve is not None:
+                bend_x, bend_y, cube_x, cube_y = (
+                    curve[0, y, x],
+                    curve[1, y, x],
+                    curve[2, y, x],
+                    curve[3, y, x],
+                )
+                bend, cube = place_of(bend_x, bend_y), place_of(cube_x, cube_y)
+                curved_x, curved_y = _curved_reach(bend_x, cube_x), _curved_reach(bend_y, cube_y)
+            within = _inside(x0, along_x, wide, curved_x, right) and _inside(
+                y0, along_y, wide, curved_y, bottom
+            )
+            if within and not cubic:
                 start, along = place_of(x0, y0), place_of(along_x, along_y)
                 sums = black_pair()
                 for k in range(len(samples)):
                     place = _seen_from(start, along, wide, samples, k)
+                    if curve is not None:
+                        place = place + bend * bow(samples[k, 0]) + cube * ess(samples[k, 0])
                     a, b = fractions_of(place)
                     at = offset_of(place, columns)
                     above, under = load_pair(image, at), load_pair(image, at + next_row)
@@ -201,8 +253,13 @@ def expose(
                 continue
             total = black()
             for k in range(len(samples)):
-                i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
-                j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
+                at_x = x0 + samples[k, 0] * along_x + samples[k, 1] * wide
+                at_y = y0 + samples[k, 0] * along_y + samples[k, 2] * wide
+                if curve is not None:
+                    at_x += bow(samples[k, 0]) * bend_x + ess(samples[k, 0]) * cube_x
+                    at_y += bow(samples[k, 0]) * bend_y + ess(samples[k, 0]) * cube_y
+                i, a = between(at_x, right)
+                j, b = between(at_y, bottom)
                 if cubic:
                     across, weights = _neighbours(i, columns), _cubic(a)
                     down, parts = _neighbours(j, rows), _cubic(b)
@@ -227,6 +284,7 @@ def spread(
     offset: ArrayF32,  # [2, H, W]
     sweep: ArrayF32,  # [2, H, W]
     radius: ArrayF32,  # [H, W]
+    curve: ArrayF32 | None,  # [4, H, W]
     samples: ArrayF32,  # [K, 3] t, u, v
     bands: ArrayF32,  # [bands, BAND + 2 reach, W + 2 margin, 4], written
     rows: int,
@@ -252,11 +310,26 @@ def spread(
                 x0 = np.float32(x + margin) + offset[0, y, x]
                 y0 = np.float32(y + margin) + offset[1, y, x]
                 along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
-                if not cubic and _inside(x0, along_x, wide, right) and _inside(y0, along_y, wide, bottom):
+                curved_x, curved_y = _ZERO, _ZERO
+                if curve is not None:
+                    bend_x, bend_y, cube_x, cube_y = (
+                        curve[0, y, x],
+                        curve[1, y, x],
+                        curve[2, y, x],
+                        curve[3, y, x],
+                    )
+                    bend, cube = place_of(bend_x, bend_y), place_of(cube_x, cube_y)
+                    curved_x, curved_y = _curved_reach(bend_x, cube_x), _curved_reach(bend_y, cube_y)
+                within = _inside(x0, along_x, wide, curved_x, right) and _inside(
+                    y0, along_y, wide, curved_y, bottom
+                )
+                if within and not cubic:
                     start, along = place_of(x0, y0), place_of(along_x, along_y)
                     twice = both(seen)
                     for k in range(len(samples)):
                         place = _seen_from(start, along, wide, samples, k)
+                        if curve is not None:
+                            place = place + bend * bow(samples[k, 0]) + cube * ess(samples[k, 0])
                         a, b = fractions_of(place)
                         at = offset_of(place, columns) - CHANNELS * first * columns
                         across = shares(a)
@@ -264,8 +337,13 @@ def spread(
                         store(part, at + next_row, load_pair(part, at + next_row) + twice * (across * b))
                     continue
                 for k in range(len(samples)):
-                    i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
-                    j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
+                    at_x = x0 + samples[k, 0] * along_x + samples[k, 1] * wide
+                    at_y = y0 + samples[k, 0] * along_y + samples[k, 2] * wide
+                    if curve is not None:
+                        at_x += bow(samples[k, 0]) * bend_x + ess(samples[k, 0]) * cube_x
+                        at_y += bow(samples[k, 0]) * bend_y + ess(samples[k, 0]) * cube_y
+                    i, a = between(at_x, right)
+                    j, b = between(at_y, bottom)
                     if cubic:
                         across, weights = _neighbours(i, columns), _cubic(a)
                         down, parts = _neighbours(j, rows), _cubic(b)
@@ -311,106 +389,3 @@ def multiply(light: ArrayF32, slope: ArrayF32, out: ArrayF32) -> None:
                 out[y, x, c] = light[y, x, c] * slope[y, x, c]
             if padded:
                 out[y, x, 3] = _ZERO
-
-
-@kernel
-def misfits(
-    image: ArrayF32,  # [H, W]
-    observed: ArrayF32,  # [H, W]
-    weight: ArrayF32,  # [H, W]
-    offset: ArrayF32,  # [2, H, W]
-    sweep: ArrayF32,  # [2, H, W]
-    radius: ArrayF32,  # [H, W]
-    samples: ArrayF32,  # [K, 3] t, u, v
-    limit: float,
-    rows: AnyArray,  # [H] float64, written
-) -> None:
-    """Write each row's sum of weight * min(|observed - warped image|, limit); images have no margin.
-
-    Pixels with weight 0 are skipped.
-    """
-    height, width = image.shape
-    right, bottom = np.float32(width - 1), np.float32(height - 1)
-    share = _ONE / np.float32(len(samples))
-    for y in prange(height):
-        # Pixels that count are packed without gaps, so that the inner loop can be vectorised.
-        place, along = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
-        wide, exposed = np.empty(width, np.float32), np.zeros(width, np.float32)
-        count = 0
-        for x in range(width):
-            if weight[y, x] != 0.0:
-                place[0, count] = np.float32(x) + offset[0, y, x]
-                place[1, count] = np.float32(y) + offset[1, y, x]
-                along[0, count], along[1, count] = sweep[0, y, x], sweep[1, y, x]
-                wide[count] = radius[y, x]
-                count += 1
-        for k in range(len(samples)):
-            for n in range(count):
-                i, a = _between(place[0, n] + samples[k, 0] * along[0, n] + samples[k, 1] * wide[n], right)
-                j, b = _between(place[1, n] + samples[k, 0] * along[1, n] + samples[k, 2] * wide[n], bottom)
-                above = image[j, i] + a * (image[j, i + 1] - image[j, i])
-                below = image[j + 1, i] + a * (image[j + 1, i + 1] - image[j + 1, i])
-                exposed[n] += above + b * (below - above)
-        total, count = 0.0, 0
-        for x in range(width):
-            if weight[y, x] != 0.0:
-                total += weight[y, x] * min(abs(observed[y, x] - exposed[count] * share), limit)
-                count += 1
-        rows[y] = total
-
-
-@kernel
-def normal_equations(
-    stack: ArrayF32,  # [H, W, 3]: image, its derivatives by x and y
-    observed: ArrayF32,  # [H, W]
-    weight: ArrayF32,  # [H, W]
-    basis: ArrayF32,  # [6, 2, H, W]: image motion per component of a twist, px
-    down: ArrayF32,  # [H]: -1/2 at the first row of the frame, 1/2 at its last
-    offset: ArrayF32,  # [2, H, W]
-    sweep: ArrayF32,  # [2, H, W]
-    times: ArrayF32,  # [K]
-    outlier: float,
-    active: AnyArray,  # [A] int64: unknowns, of the 18 numbers of pose, blur and skew
-    matrices: AnyArray,  # [H, A, A] float64, written (lower triangles)
-    sides: AnyArray,  # [H, A] float64, written
-) -> None:
-    """Write each row's share of the Gauss-Newton equations for the twists of pose, blur and skew.
-
-    Differences beyond ``outlier`` count linearly (Huber's weights).
-    """
-    height, width = observed.shape
-    right, bottom = np.float32(width - 1), np.float32(height - 1)
-    share = 1.0 / times.size
-    twist = basis.shape[0]
-    for y in prange(height):
-        matrices[y] = 0.0
-        sides[y] = 0.0
-        jacobian = np.empty(3 * twist)
-        means = np.empty(5, np.float32)
-        for x in range(width):
-            if weight[y, x] == 0.0:
-                continue
-            means[:] = 0.0
-            for t in times:
-                i, a = _between(np.float32(x) + offset[0, y, x] + t * sweep[0, y, x], right)
-                j, b = _between(np.float32(y) + offset[1, y, x] + t * sweep[1, y, x], bottom)
-                for c in range(3):
-                    above = stack[j, i, c] + a * (stack[j, i + 1, c] - stack[j, i, c])
-                    below = stack[j + 1, i, c] + a * (stack[j + 1, i + 1, c] - stack[j + 1, i, c])
-                    value = above + b * (below - above)
-                    means[c] += value
-                    if c > 0:
-                        means[c + 2] += t * value
-            for n in range(twist):
-                u, v = share * basis[n, 0, y, x], share * basis[n, 1, y, x]
-                moved = u * means[1] + v * means[2]
-                jacobian[n] = moved
-                jacobian[twist + n] = u * means[3] + v * means[4]
-                jacobian[2 * twist + n] = down[y] * moved
-            left = observed[y, x] - share * means[0]
-            factor = weight[y, x] / max(1.0, abs(left) / outlier)
-            for n in range(len(active)):
-                scaled = factor * jacobian[active[n]]
-                sides[y, n] += scaled * left
-                for m in range(n + 1):
-                    matrices[y, n, m] += scaled * jacobian[active[m]]

@@ -28,7 +28,7 @@ LEAST_LIGHT = 1e-18
 
 @triton.jit
 def twist_of(motion, part):
-    """Return six numbers of a frame's motion: ``part`` 0 is the pose, 1 the blur, 2 the skew."""
+    """Return a twist of a frame's motion, by its number in ``cleargs.formation.motion.TWISTS``."""
     first = motion + layout.TWISTS + 6 * part
     return (
         tl.load(first),
@@ -50,8 +50,24 @@ def flow(x, y, near, twist):
 
 
 @triton.jit(do_not_specialize=["height", "width", "margin"])
-def displace(depth, alpha, motion, offset, sweep, radius, height, width, margin, BLOCK: tl.constexpr):
-    """Store the fields of a frame's motion and defocus; depth, alpha [H + 2 margin, W + 2 margin]."""
+def displace(
+    depth,
+    alpha,
+    motion,
+    offset,
+    sweep,
+    radius,
+    curve,
+    height,
+    width,
+    margin,
+    CURVED: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Store the fields of a frame's motion and defocus; depth, alpha [H + 2 margin, W + 2 margin].
+
+    ``curve`` is written where ``CURVED``.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane = height * width
     inside = pixel < plane
@@ -74,6 +90,11 @@ def displace(depth, alpha, motion, offset, sweep, radius, height, width, margin,
     blur_x, blur_y = flow(x, y, near, twist_of(motion, 1))
     tl.store(sweep + pixel, blur_x, mask=inside)
     tl.store(sweep + plane + pixel, blur_y * (fy / fx), mask=inside)
+    if CURVED:
+        for part in tl.static_range(2):
+            along_x, along_y = flow(x, y, near, twist_of(motion, 3 + part))
+            tl.store(curve + 2 * part * plane + pixel, along_x, mask=inside)
+            tl.store(curve + (2 * part + 1) * plane + pixel, along_y * (fy / fx), mask=inside)
     disc = tl.load(motion + layout.DISC) * tl.abs(near - tl.load(motion + layout.FOCUS))
     tl.store(radius + pixel, disc, mask=inside)
 
@@ -87,6 +108,25 @@ def look(pixel, inside, offset, sweep, radius, height, width, margin):
     along_x = tl.load(sweep + pixel, mask=inside, other=0.0)
     along_y = tl.load(sweep + plane + pixel, mask=inside, other=0.0)
     return x, y, along_x, along_y, tl.load(radius + pixel, mask=inside, other=0.0)
+
+
+@triton.jit
+def curve_at(pixel, inside, curve, plane, CURVED: tl.constexpr):
+    """Return bend and cube of pixels, each as x and y; zeros where the paths are straight."""
+    if CURVED:
+        bend_x = tl.load(curve + pixel, mask=inside, other=0.0)
+        bend_y = tl.load(curve + plane + pixel, mask=inside, other=0.0)
+        cube_x = tl.load(curve + 2 * plane + pixel, mask=inside, other=0.0)
+        cube_y = tl.load(curve + 3 * plane + pixel, mask=inside, other=0.0)
+        return bend_x, bend_y, cube_x, cube_y
+    else:
+        return 0.0, 0.0, 0.0, 0.0
+
+
+@triton.jit
+def aside(t, bend, cube):
+    """Return the displacement from the straight path at a time of the exposure."""
+    return (t * t - 1.0 / 12.0) * bend + t * (t * t - 3.0 / 20.0) * cube
 
 
 @triton.jit
@@ -125,6 +165,7 @@ def gather_light(
     offset,
     sweep,
     radius,
+    curve,
     samples,
     light,
     height,
@@ -133,6 +174,7 @@ def gather_light(
     count,
     share,
     TAPS: tl.constexpr,
+    CURVED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Store the light that the sensor gathers from a still image, ``light`` [H, W, 4].
@@ -144,12 +186,16 @@ def gather_light(
     channel = tl.arange(0, layout.CHANNELS)[None, :]
     rows, columns = height + 2 * margin, width + 2 * margin
     x, y, along_x, along_y, wide = look(pixel, inside, offset, sweep, radius, height, width, margin)
+    bend_x, bend_y, cube_x, cube_y = curve_at(pixel, inside, curve, height * width, CURVED)
     shape: tl.constexpr = [BLOCK, layout.CHANNELS]
     total = tl.zeros(shape, tl.float32)
     for k in range(0, count):
         t, u, v = tl.load(samples + 3 * k), tl.load(samples + 3 * k + 1), tl.load(samples + 3 * k + 2)
-        i, a = between(x + t * along_x + u * wide, columns)
-        j, b = between(y + t * along_y + v * wide, rows)
+        at_x, at_y = x + t * along_x + u * wide, y + t * along_y + v * wide
+        if CURVED:
+            at_x, at_y = at_x + aside(t, bend_x, cube_x), at_y + aside(t, bend_y, cube_y)
+        i, a = between(at_x, columns)
+        j, b = between(at_y, rows)
         across, down = shares(a, TAPS), shares(b, TAPS)
         for m in tl.static_range(TAPS):
             for n in tl.static_range(TAPS):
@@ -166,6 +212,7 @@ def return_light(
     offset,
     sweep,
     radius,
+    curve,
     samples,
     scale,
     sums,
@@ -174,6 +221,7 @@ def return_light(
     margin,
     count,
     TAPS: tl.constexpr,
+    CURVED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Add ``light`` times ``scale`` to ``sums`` (int64): the transpose of `gather_light`."""
@@ -182,13 +230,17 @@ def return_light(
     channel = tl.arange(0, layout.CHANNELS)[None, :]
     rows, columns = height + 2 * margin, width + 2 * margin
     x, y, along_x, along_y, wide = look(pixel, inside, offset, sweep, radius, height, width, margin)
+    bend_x, bend_y, cube_x, cube_y = curve_at(pixel, inside, curve, height * width, CURVED)
     coloured = inside[:, None] & (channel < 3)
     seen = tl.load(light + pixel[:, None] * layout.CHANNELS + channel, mask=coloured, other=0.0)
     seen *= tl.load(scale)
     for k in range(0, count):
         t, u, v = tl.load(samples + 3 * k), tl.load(samples + 3 * k + 1), tl.load(samples + 3 * k + 2)
-        i, a = between(x + t * along_x + u * wide, columns)
-        j, b = between(y + t * along_y + v * wide, rows)
+        at_x, at_y = x + t * along_x + u * wide, y + t * along_y + v * wide
+        if CURVED:
+            at_x, at_y = at_x + aside(t, bend_x, cube_x), at_y + aside(t, bend_y, cube_y)
+        i, a = between(at_x, columns)
+        j, b = between(at_y, rows)
         across, down = shares(a, TAPS), shares(b, TAPS)
         for m in tl.static_range(TAPS):
             for n in tl.static_range(TAPS):
@@ -217,24 +269,25 @@ def follow_curve(image, curve, out, slope, pixels, FROM: tl.constexpr, TO: tl.co
 
 @memory_errors()
 def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) -> DisplacementFields:
-    """See ``cleargs.formation.warp.displacement_fields``. ``motion`` [25] is on the CPU."""
+    """See ``cleargs.formation.warp.displacement_fields``. ``motion`` [37] is on the CPU."""
     height, width = (side - 2 * margin for side in depth.shape)
     offset, sweep = depth.new_empty(2, height, width), depth.new_empty(2, height, width)
     radius = depth.new_empty(height, width)
+    curve = depth.new_empty(4, height, width) if motion[layout.CURVES :].any() else None
+    fields = DisplacementFields(offset, sweep, radius, None, curve)
     displace[(_blocks(radius),)](
         depth.contiguous(),
         alpha.contiguous(),
         motion.to(depth.device, non_blocking=True),  # read before the call returns
-        offset,
-        sweep,
-        radius,
+        *_planes(fields),
         height,
         width,
         margin,
+        CURVED=curve is not None,
         BLOCK=BLOCK,
         num_warps=4,
     )
-    return DisplacementFields(offset, sweep, radius)
+    return fields
 
 
 @memory_errors()
@@ -244,7 +297,7 @@ def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin
     light = image.new_empty(height, width, CHANNELS)
     gather_light[(_blocks(fields.radius),)](
         image.contiguous(),
-        *fields[:3],
+        *_planes(fields),
         samples,
         light,
         height,
@@ -253,6 +306,7 @@ def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin
         len(samples),
         1.0 / len(samples),
         TAPS=_taps(samples),
+        CURVED=fields.curve is not None,
         BLOCK=BLOCK,
         num_warps=4,
     )
@@ -272,7 +326,7 @@ def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, 
     )
     return_light[(_blocks(fields.radius),)](
         light.contiguous(),
-        *fields[:3],
+        *_planes(fields),
         samples,
         2.0**bits / len(samples) / bound,
         sums,
@@ -281,10 +335,17 @@ def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, 
         margin,
         len(samples),
         TAPS=_taps(samples),
+        CURVED=fields.curve is not None,
         BLOCK=BLOCK,
         num_warps=4,
     )
     return sums.float().mul_(bound * 2.0**-bits)
+
+
+def _planes(fields: DisplacementFields) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return offset, sweep, radius and curve; for straight paths a tensor that the kernels do not read."""
+    curve = fields.offset if fields.curve is None else fields.curve
+    return fields.offset, fields.sweep, fields.radius, curve
 
 
 def _taps(samples: Tensor) -> int:

@@ -168,12 +168,14 @@ def warp(size: tuple[int, int], backend: Backend, device: torch.device) -> Resul
     image, depth = seen[..., :4].contiguous(), 2.0 + seen[..., 4]
     camera = [width, width, width / 2, height / 2, 2.5, 3.0, 1.4]  # fx fy cx cy, median depth, disc, focus
     twists = [0, 1, 0, -2, 1, 0, 2, 1, -1, 4, 9, 2, 1, 0, 2, 3, 5, -2]  # pose, blur, skew
-    motion = torch.tensor([*camera, *twists], dtype=torch.float32)
+    curves = [1, 0, 1, -6, 3, 2, 0, 2, 0, 20, 9, 1]  # bend, cube
+    motion = torch.tensor([*camera, *twists, *curves], dtype=torch.float32)
     fields = backend.displacements(depth, torch.ones_like(depth), motion, margin=margin)
     times = torch.linspace(-0.5, 0.5, 7)
     samples = torch.stack([times, times.flip(0), (3.0 * times).sin()], dim=1).to(device)
     curve = torch.linspace(0.0, 1.0, warp_layout.CURVE_STEPS + 1).square().to(device)
     linear, slope = backend.through_curve(image, curve, 4)
+    assert fields.curve is not None
     exposed = backend.expose(image, fields, samples, margin=margin)
     still = backend.expose(image, fields, samples[3:4], margin=margin)  # by cubic interpolation
     returned = backend.expose_backward(exposed, fields, samples, margin=margin)
@@ -181,11 +183,12 @@ def warp(size: tuple[int, int], backend: Backend, device: torch.device) -> Resul
     return {
         "offset": (fields.offset, within(1e-4)),
         "sweep": (fields.sweep, within(1e-4)),
+        "curve": (fields.curve, within(1e-4)),
         "discs": (fields.radius, within(1e-4)),
         "exposed image": (exposed[..., :3], within(6e-4)),
         "image of one sample": (still[..., :3], within(6e-4)),
         "transpose": (returned[..., :3], within(2e-3)),
-        "curve": (linear[..., :3], within(1e-6)),
+        "colour curve": (linear[..., :3], within(1e-6)),
         "slope": (slope, within(1e-4)),
         "product with the slope": (backend.times_slope(image, slope, 4)[..., :3], within(1e-4)),
     }

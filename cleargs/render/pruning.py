@@ -1,4 +1,4 @@
-"""``cleargs export --prune`` and ``--crop``: leave out Gaussians, and measure the loss of PSNR."""
+"""Leave out Gaussians of a scene, and measure the loss of PSNR: ``cleargs export --prune`` and ``--crop``."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.capture.tables import load_frames
-from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import real_views
 from cleargs.formation.observed import evaluate_views
 from cleargs.formation.table import read_formation
 from cleargs.parquet import read_table
+from cleargs.progress import Reporter
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
@@ -68,7 +68,9 @@ def _parsed(rule: str, **counts: int) -> tuple[str, tuple[float, ...]]:
     return kind, values if len(values) == counts.get(kind) and np.isfinite(values).all() else ()
 
 
-def prune_scene(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str) -> tuple[Scene, str]:
+def prune_scene(
+    scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str, reporter: Reporter
+) -> tuple[Scene, str]:
     """Remove the Gaussians below a threshold.
 
     Args:
@@ -76,6 +78,7 @@ def prune_scene(scene: Scene, thresholds: Mapping[str, float], run: Path, stage:
         thresholds: The result of `parse_prune`.
         run: The run folder.
         stage: The stage whose image formation applies when the PSNR of the training frames is measured.
+        reporter: Receives the progress.
 
     Returns:
         The smaller scene, and a message with the number of removed Gaussians and the PSNR before and after.
@@ -83,7 +86,7 @@ def prune_scene(scene: Scene, thresholds: Mapping[str, float], run: Path, stage:
     ingest, folder = run / "ingest", run / stage
     allocation = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
     views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
-    gaussians, reporter = scene.gaussians, make_reporter()
+    gaussians = scene.gaussians
     keep = torch.sigmoid(gaussians.logit_opacities) >= thresholds.get("opacity", 0.0)
     if "contribution" in thresholds:
         with reporter.task("contributions", len(views)) as task:

@@ -1,0 +1,248 @@
+"""Real captures by the protocols of the literature, next to published figures: ``real.toml``."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pydantic import Field, ValidationError
+
+from benchmarks.comparison.cells import Cell, Cells, Spread
+from benchmarks.comparison.findings import Comparison, compare_scenes
+from benchmarks.comparison.pictures import find_image
+from benchmarks.comparison.scenes import Sample, SceneRecipe, evaluate_views, make_scenes
+from benchmarks.comparison.tables import Table
+from benchmarks.comparison.variants import VARIANTS, find_variants
+from benchmarks.images import read_rgb_float
+from cleargs.base_model import FrozenModel
+from cleargs.capture.tables import load_frames
+from cleargs.errors import CleargsError, ConfigError, InputError
+from cleargs.media.contact_sheet import Tile, contact_sheet
+from cleargs.media.image import write_rgb
+from cleargs.pipeline.store import Store
+from cleargs.progress import Reporter
+from cleargs.safe_io import FAULTS, cause, read_text
+
+SHOWCASE = "blurball"
+"""Scene of the picture: its licence (CC BY 4.0) allows to show it."""
+SHOWN = "001"
+"""Stem of the blurred photograph of the picture, next to the first held-out view."""
+REFINE_STEPS = 15
+"""Steps of fitting each test pose for the second PSNR."""
+REFINED = "psnr_refined"
+
+_BLOCK = re.compile(r"(<!-- real -->\n).*?(<!-- /real -->)", re.DOTALL)
+
+
+class RealScene(FrozenModel):
+    """A capture with its protocol."""
+
+    name: str
+    capture: str
+    """Place in the folder of the captures."""
+    settings: tuple[str, ...]
+    steps: int | None = Field(None, ge=1)
+    protocol: str
+
+
+class Published(FrozenModel):
+    """A published result."""
+
+    scene: str
+    method: str
+    psnr: float
+    ssim: float | None = None
+    lpips: float | None = None
+    source: str
+    protocol: str
+    second_hand: bool = False
+    """Not read in the paper or its log, but in another text."""
+
+
+class RealList(FrozenModel):
+    """``real.toml``."""
+
+    scenes: tuple[RealScene, ...] = Field(min_length=1)
+    published: tuple[Published, ...]
+
+
+def read_real_list(path: Path | None = None) -> RealList:
+    """Read a list of real captures, by default ``real.toml``; raise ConfigError if it is invalid."""
+    hint = "compare it with benchmarks/comparison/real.toml"
+    try:
+        text = read_text(path or Path(__file__).with_name("real.toml"))
+        return RealList.model_validate(tomllib.loads(text))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ConfigError(f"list of real captures, {place}: {first['msg']}", hint=hint) from error
+    except FAULTS as error:
+        raise ConfigError(f"cannot read the list of real captures: {cause(error)}", hint=hint) from error
+
+
+def find_scenes(listed: RealList, names: Sequence[str]) -> tuple[RealScene, ...]:
+    """Return the named scenes, or all without names; raise InputError for an unknown name."""
+    known = [scene.name for scene in listed.scenes]
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"no scene is called {unknown[0]!r}", hint=f"choose among {', '.join(known)}")
+    return tuple(scene for scene in listed.scenes if not names or scene.name in names)
+
+
+def run_scenes(
+    out: Path,
+    captures: Path,
+    scenes: Sequence[RealScene],
+    variants: Sequence[str],
+    seeds: int,
+    recipe: SceneRecipe,
+    store: Store,
+    reporter: Reporter,
+) -> Comparison:
+    """Train and evaluate each variant on each scene; what an earlier call finished is reused.
+
+    Args:
+        out: Folder of the benchmark.
+        captures: Folder of the captures.
+        scenes: Scenes to run.
+        variants: Names of the variants.
+        seeds: Number of trainings, with seeds from 0.
+        recipe: Settings that all runs share.
+        store: Store of the runs.
+        reporter: Receives progress and warnings.
+
+    Returns:
+        The results. PSNR with refined test poses is the metric `REFINED`. Missing captures and scenes are
+        among the failures.
+    """
+    found = Comparison()
+    for scene in scenes:
+        place = captures / scene.capture
+        if not place.exists():
+            found.failures.append(f"{scene.name}: {place} does not exist")
+            reporter.warn(found.failures[-1])
+            continue
+        own = replace(
+            recipe, overrides=(*scene.settings, *recipe.overrides), steps=recipe.steps or scene.steps
+        )
+        refined = replace(
+            own, options=own.options.model_copy(update={"refine_poses": REFINE_STEPS, "lpips": ()})
+        )
+        samples = [Sample(place.absolute(), seed, None, scene.name) for seed in range(seeds)]
+        made = make_scenes(out, samples, find_variants(variants), own, store, reporter)
+        try:
+            compared = compare_scenes(out, made, own, store, reporter)
+            for number, finished in enumerate(compared.scenes):
+                (cell,) = evaluate_views(out, finished, refined, store, reporter)
+                means = compared.cells[number].means | {REFINED: cell.means["psnr"]}
+                compared.cells[number] = compared.cells[number].model_copy(update={"means": means})
+        except CleargsError as error:
+            found.failures.append(f"{scene.name}: {error}")
+            continue
+        found.add(compared)
+    return found
+
+
+def real_table(listed: RealList, found: Comparison) -> str:
+    """Return the table of the results and the published figures, with its conditions, as Markdown."""
+    cells, labels = found.results.cells, {variant.name: variant.label for variant in VARIANTS}
+    head = ["", "", "PSNR", "PSNR, test poses refined", "SSIM", "LPIPS (AlexNet)", "processor minutes"]
+    rows, notes = [], []
+    for scene in listed.scenes:
+        shown = [variant for variant in cells.variants() if cells.of("held-out", scene.name, variant)]
+        for variant in shown:
+            rows.append([scene.name, labels[variant], *_figures(cells, scene.name, variant)])
+        if shown:
+            own = cells.of("held-out", scene.name, shown[0])
+            notes.append(f"* {scene.name}: {scene.protocol}; {own[0].images} views, {own[0].steps:,} steps.")
+        rows += [_published(one) for one in listed.published if one.scene == scene.name and shown]
+    names = {scene.name for scene in listed.scenes}
+    rows += [_published(one) for one in listed.published if one.scene not in names]
+    notes += [
+        f"* {one.method}: {one.source}; {one.protocol}."
+        for one in listed.published
+        if one.scene not in names or cells.columns("held-out").count(one.scene)
+    ]
+    seeds = (
+        len({cell.sample for cell in cells.cells if cell.column == cells.cells[0].column})
+        if cells.cells
+        else 0
+    )
+    mean = f"Means of {seeds} trainings, ± sample standard deviation." if seeds > 1 else "One training each."
+    line = f"{mean} Published results are in italics; those marked * were read at second hand."
+    missing = [f"* Not made: {failure}." for failure in found.failures]
+    return "\n\n".join([Table(head, rows).markdown(), line, "\n".join([*notes, *missing])])
+
+
+def _figures(cells: Cells, column: str, variant: str) -> list[str]:
+    def text(spread: Spread | None, digits: int) -> str:
+        if spread is None:
+            return "-"
+        more = f" ± {spread.deviation:.{digits}f}" if spread.deviation is not None else ""
+        return f"{spread.mean:.{digits}f}{more}"
+
+    metrics = (("psnr", 2), (REFINED, 2), ("ssim", 3), ("lpips_alex", 3))
+    return [
+        *(text(cells.spread("held-out", column, variant, metric), digits) for metric, digits in metrics),
+        _minutes(cells.of("held-out", column, variant)),
+    ]
+
+
+def _minutes(cells: Sequence[Cell]) -> str:
+    known = [cell.cpu_seconds for cell in cells if cell.cpu_seconds is not None]
+    return f"{sum(known) / len(known) / 60:.1f}" if known else "-"
+
+
+def _published(one: Published) -> list[str]:
+    figures = [f"{value:.3f}" if value is not None else "-" for value in (one.ssim, one.lpips)]
+    return [
+        one.scene,
+        f"*{one.method}*{' *' if one.second_hand else ''}",
+        f"{one.psnr:.2f}",
+        "-",
+        *figures,
+        "-",
+    ]
+
+
+def showcase(path: Path, out: Path, found: Comparison) -> bool:
+    """Write a row of `SHOWCASE`: blurred photograph, all frames alike, ClearGS, sharp reference.
+
+    Returns:
+        False if its scenes were not made.
+    """
+    cells = {cell.variant: cell for cell in reversed(found.cells) if cell.column == SHOWCASE}
+    scene = next((one for one in found.scenes if one.sample.column == SHOWCASE), None)
+    if scene is None or "full" not in cells:
+        return False
+    view = sorted(path.stem for path in (out / cells["full"].evaluation).glob("*.png"))[0]
+    ingest = scene.run / "ingest"
+    images = {Path(frame.name).stem: ingest / frame.image for frame in load_frames(ingest)}
+    tiles = [Tile(read_rgb_float(images[SHOWN]), "photograph")]
+    tiles += [
+        Tile(find_image(out / cells[name].evaluation, view), label)
+        for name, label in (("all-view", "all frames alike"), ("full", "ClearGS"))
+        if name in cells
+    ]
+    tiles.append(Tile(read_rgb_float(images[view]), "reference"))
+    write_rgb(path, contact_sheet([tiles], tile_width=480))
+    return True
+
+
+def with_table(page: str, table: str) -> str:
+    """Return ``page`` with ``table`` between the lines ``<!-- real -->`` and ``<!-- /real -->``.
+
+    Raises:
+        InputError: if the page has no such lines.
+    """
+    if not _BLOCK.search(page):
+        raise InputError("the page has no place for the table", hint="add <!-- real --> and <!-- /real -->")
+    return _BLOCK.sub(lambda match: f"{match[1]}\n{table}\n\n{match[2]}", page)
+
+
+def table_of(page: str) -> str:
+    """Return what `with_table` put into ``page``; "" without a place for it."""
+    found = _BLOCK.search(page)
+    return found[0].removeprefix("<!-- real -->").removesuffix("<!-- /real -->").strip() if found else ""

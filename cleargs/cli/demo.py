@@ -1,0 +1,40 @@
+"""``cleargs demo``: make a small synthetic capture and run it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cleargs.cli.common import output_option, quality_option, quiet_option, store_option, work_options
+from cleargs.cli.progress_bars import make_reporter
+from cleargs.cli.run import run
+
+
+@click.command()
+@output_option("Folder of the demo.", "folder", required=False)
+@click.option("--open", "opens", is_flag=True, help="Open the report in the browser at the end.")
+@quality_option
+@work_options
+@store_option
+@quiet_option
+@click.pass_context
+def demo(
+    context: click.Context, /, folder: Path | None, opens: bool, quality: str | None, **options: Any
+) -> int:
+    """Make a synthetic capture of 16 frames in the folder demo, and turn it into a scene: a few minutes.
+
+    The capture is demo/capture, and the run is demo/run. The same command again resumes.
+    """
+    from cleargs.synth.synthetic_capture import make_capture
+
+    place = folder or Path("demo")
+    capture = place / "capture"
+    if not (capture / "transforms.json").is_file():
+        reporter = make_reporter(options["quiet"])
+        place.mkdir(parents=True, exist_ok=True)
+        make_capture(capture, "mixed", frames=16, width=480, height=270, seed=0, reporter=reporter)
+    given = {"recipe": "smoke", "overrides": ("ingest.poses=sfm",), "quality": quality}
+    made = context.invoke(run, source=capture, folder=place / "run", opens=opens, **given, **options)
+    return int(made)

@@ -1,0 +1,73 @@
+"""``cleargs pack``: a run as one file, without links."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from cleargs.cli.common import FILE, answer, json_option, run_argument
+from cleargs.errors import InputError
+from cleargs.files import atomic_path
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
+from cleargs.run_results import scene_stage
+
+KEPT = ("manifest.json", "*.parquet", "colmap/**/*")
+"""Files of every stage that go into the pack."""
+
+MADE_OF_NAMES = re.compile(r'^(input = ").*/(.*")$|^store = .*\n', re.MULTILINE)
+"""Lines of ``run.toml`` with paths of this machine: the input, of which the name stays, and the store."""
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs pack room                   writes room.zip
+  cleargs pack room -o /tmp/for-anna.zip
+  unzip room.zip && cleargs export room --for blender      on the other machine
+"""
+)
+@run_argument
+@click.option("-o", "--output", type=FILE, help="The new file (.zip).  [default: RUN.zip]")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+@json_option
+@click.pass_obj
+def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -> None:
+    """Pack what is needed to look at RUN and to export it into a ZIP file.
+
+    These are the report, the last scene, the poses and the tables. The images, the earlier scenes and the
+    candidates of repairs are left out, so a packed run cannot be continued.
+    """
+    name = read_run_file(run, dag).folder.name
+    output = output or Path(f"{name}.zip")
+    if output.suffix.lower() != ".zip":
+        raise InputError(f"{output} does not end in .zip", hint="name the file NAME.zip")
+    if output.exists() and not force:
+        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+    scene = run / scene_stage(dag, run, None) / SCENE
+    files = {file.relative_to(run).as_posix(): file for file in (scene, *_files(run, dag))}
+    with atomic_path(output) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        for inside, file in sorted(files.items()):
+            content = file.read_bytes()
+            if inside == RUN_FILE:
+                content = MADE_OF_NAMES.sub(r"\1\2", content.decode()).encode()
+            entry = zipfile.ZipInfo(f"{name}/{inside}")  # with a fixed date: equal runs give equal packs
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
+    size = output.stat().st_size
+    answer(
+        as_json,
+        {"file": str(output), "files": len(files), "bytes": size},
+        f"{output}: {len(files)} files, {size / 1e6:.1f} MB",
+    )
+
+
+def _files(run: Path, dag: Dag) -> Iterator[Path]:
+    patterns = [RUN_FILE, "report.html", "report/**/*", "eval/**/*"]
+    patterns += [f"{stage}/{kept}" for stage in dag.names for kept in KEPT]
+    for pattern in patterns:
+        yield from (file for file in run.glob(pattern) if file.is_file())

@@ -1,0 +1,173 @@
+"""Write the scene of a run for other programs."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from cleargs.capture.cameras import Similarity
+from cleargs.capture.model import read_model, transform_model, write_model
+from cleargs.capture.tables import load_frames, load_points
+from cleargs.digest import named_files
+from cleargs.errors import InputError
+from cleargs.files import disk_errors, write_json
+from cleargs.formation.frames import view_of
+from cleargs.manifest import linked_manifest
+from cleargs.progress import Reporter
+from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
+from cleargs.run_results import SCENE
+from cleargs.splat.camera import Camera, cameras_json
+from cleargs.splat.formats import check_options, format_of, padded, write_scene
+from cleargs.splat.ply import read_ply
+from cleargs.splat.transforms import far_offset, orient_up, transform_scene
+
+MODEL = "colmap/sparse/0"
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Choices of `export_scene`; see ``cleargs export --help``."""
+
+    up: str | None = None
+    world: Literal["normalised", "input"] = "normalised"
+    metres: str | None = None
+    """``A-B=D``: the cameras of frames A and B are D metres apart."""
+    sh_degree: int | None = None
+    prune: Sequence[str] = ()
+    crop: str | None = None
+    spz_version: int | None = None
+    cameras: bool = False
+    """Write cameras and COLMAP model too."""
+    force: bool = False
+    """Replace existing files."""
+
+
+def export_scene(
+    run: Path, stage: str, outputs: Sequence[Path], options: ExportOptions, reporter: Reporter
+) -> list[str]:
+    """Write the scene of ``stage`` to each of the ``outputs``. Return messages about the result.
+
+    Raises:
+        InputError: an option cannot be used, or a file exists and is not to be replaced.
+    """
+    kinds = [format_of(output) for output in outputs]
+    for kind in kinds:
+        check_options(kind, up=options.up, spz_version=options.spz_version)
+    if options.up is not None and options.world == "input":
+        raise InputError("--up and --world input exclude each other", hint="give one of them")
+    thresholds, region = parse_prune(options.prune), parse_crop(options.crop)
+    for output in outputs:
+        _require_free(output, options)
+    ingest = run / "ingest"
+    posed = [frame for frame in load_frames(ingest) if frame.registered]
+    cameras = {frame.frame_id: (frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed}
+    similarity = _similarity(ingest, cameras, options)
+    scene, messages = read_ply(run / stage / SCENE), []
+    if thresholds:
+        scene, message = prune_scene(scene, thresholds, run, stage, reporter)
+        messages.append(message)
+    if options.sh_degree is not None:
+        scene = padded(scene, options.sh_degree)
+    if options.world == "input" and (offset := far_offset(scene.gaussians, similarity)):
+        similarity["translation"] = similarity["translation"] - np.array(offset)
+        file = outputs[0].with_name(f"{_stem(outputs[0])}.offset.json")
+        write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
+        messages.append(
+            "single precision would round positions so far from the origin: the files are written without "
+            f"the offset {offset}, which is in {file}"
+        )
+    if similarity:
+        scene = transform_scene(scene, **similarity)
+    if region is not None:
+        scene, message = crop_scene(scene, region)
+        messages.append(message)
+    if "ply" in kinds and 0 < (degree := scene.gaussians.sh_degree) < 3:
+        messages.append(
+            f"spherical harmonics of degree {degree}: for viewers of degree 3 only, --sh-degree 3"
+        )
+    if scene.gaussians.num == 0:
+        raise InputError("no Gaussian is left", hint="prune or crop less")
+    for output, kind in zip(outputs, kinds, strict=True):
+        with disk_errors(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
+        if options.cameras:
+            _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
+        version = options.spz_version if kind == "spz" else None
+        write_scene(output, scene, kind, turned=options.up is not None, spz_version=version)
+    axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
+    count = scene.gaussians.num
+    return [*messages, *(f"{output}: scene of {stage}, {count} Gaussians, {axes}" for output in outputs)]
+
+
+def _stem(output: Path) -> str:
+    return output.name[: -len(format_of(output)) - 1]
+
+
+def _require_free(output: Path, options: ExportOptions) -> None:
+    if output.exists() and not options.force:
+        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+
+
+def _similarity(
+    ingest: Path, cameras: Mapping[int, tuple[str, Camera]], options: ExportOptions
+) -> dict[str, Any]:
+    """Return the similarity from the world of the run to that of the files; {} for the identity."""
+    similarity: dict[str, Any] = {}
+    if options.world == "input":
+        manifest = linked_manifest(ingest.parent, ingest.name)
+        world = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
+        similarity = {"scale": world.scale, "rotation": world.rotation.T, "translation": world.origin}
+    elif options.up is not None:
+        similarity = orient_up(next(iter(cameras.values()))[1], options.up)
+    if options.metres is not None:
+        match = re.fullmatch(r"(\d+)-(\d+)=(\d*\.?\d+)", options.metres)
+        pair = [int(match[n]) for n in (1, 2)] if match else []
+        wanted = float(match[3]) if match else 0.0
+        if not wanted or not set(pair) <= cameras.keys():
+            raise InputError(
+                f"--metres {options.metres} cannot be used",
+                hint=f"give FRAME-FRAME=METRES; frames with a pose are {min(cameras)} to {max(cameras)}",
+            )
+        similarity = similarity or {"scale": 1.0, "rotation": np.eye(3), "translation": np.zeros(3)}
+        apart = float(np.linalg.norm(cameras[pair[0]][1].centre - cameras[pair[1]][1].centre))
+        if apart == 0.0:
+            raise InputError("the two frames of --metres have the same place", hint="choose other frames")
+        factor = wanted / (apart * similarity["scale"])
+        similarity |= {name: factor * similarity[name] for name in ("scale", "translation")}
+    return similarity
+
+
+def _write_sidecars(
+    output: Path,
+    ingest: Path,
+    cameras: Sequence[tuple[str, Camera]],
+    similarity: Mapping[str, Any],
+    *,
+    force: bool,
+) -> None:
+    """Write cameras and COLMAP model next to ``output``. Equal files of an earlier export are kept.
+
+    Raises InputError if a file of another content exists.
+    """
+    sparse = read_model(ingest / MODEL)
+    with tempfile.TemporaryDirectory() as name:
+        made = Path(name)
+        write_json(made / f"{_stem(output)}.cameras.json", cameras_json(cameras, **similarity))
+        moved = transform_model(sparse, **similarity) if similarity else sparse
+        write_model(made / f"{_stem(output)}.colmap/sparse/0", moved, load_points(ingest).rgb)
+        for inside, file in named_files(made).items():
+            target, content = output.parent / inside, file.read_bytes()
+            if target.is_file() and target.read_bytes() != content and not force:
+                raise InputError(
+                    f"{target} exists already, of another export",
+                    hint="choose another name, or give --force",
+                )
+            with disk_errors(target):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(content)

@@ -1,0 +1,256 @@
+"""The advice of a report: commands that may improve the result, with their expected time and gain.
+
+The gains in dB were measured at held-out frames of real captures (docs/experiments/speed.md). The order of
+the others is a judgement.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import tomli_w
+
+from cleargs.errors import CleargsError
+from cleargs.manifest import Manifest
+from cleargs.pipeline.config import Config, load_config, recipe_names
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.plan import Planner
+from cleargs.pipeline.run_file import RunSpec
+from cleargs.pipeline.settings import flattened
+from cleargs.progress import SilentReporter
+from cleargs.report.formatting import count
+from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
+from cleargs.report.verdict import figure_of
+from cleargs.splat.config import steps_from_frames
+
+FEW_PLACED = 0.8
+"""Share of frames with a pose, below which there is advice on them."""
+MANY_UNUSED = 0.4
+"""Share of placed frames with weight 0, above which there is advice on the thresholds."""
+BLURRED_PX = 6.0
+"""Motion blur above which a frame counts as blurred, px."""
+SHORT = 0.8
+"""A training with a smaller share of the standard steps counts as short."""
+NO_FIGURE = "not measured"
+
+
+class Advice(NamedTuple):
+    """Something that may improve the result."""
+
+    what: str
+    why: str
+    gain: str
+    worth: float
+    """Order of the advice: the expected gain in dB, or a judgement in its place."""
+    options: tuple[str, ...] = ()
+    """Options of ``cleargs run``; empty if no command helps."""
+    command: str = ""
+    time: str = ""
+    """Expected time of the command; "" without a command or an estimate."""
+
+
+def shown_advice(
+    planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
+) -> list[Advice]:
+    """Return all advice on a run, the most useful first. Holding out frames is never the only command."""
+    found = sorted(_Advisor(planner, manifests, rows).advice(), key=lambda advice: -advice.worth)
+    if not any(advice.options and advice.worth for advice in found):
+        found = [advice for advice in found if advice.worth]
+    return [
+        advice._replace(
+            command=shlex.join([*_base(planner.run), *advice.options]), time=_time(planner, advice.options)
+        )
+        if advice.options
+        else advice
+        for advice in found
+    ]
+
+
+def command(run: RunSpec, dag: Dag) -> str:
+    """Return the ``cleargs run`` command that reproduces a run, to be called next to its folder."""
+    recipe, changed = _nearest_recipe(run.config, dag)
+    words = [*_base(run), *(["--recipe", recipe] if recipe != "default" else [])]
+    words += ["--seed", str(changed.pop("seed"))] if "seed" in changed else []
+    return shlex.join(words + _set(changed))
+
+
+def _base(run: RunSpec) -> list[str]:
+    """Return the words of ``cleargs run`` for a capture and a run folder, called next to the run folder."""
+    return ["cleargs", "run", os.path.relpath(run.source, run.folder.parent), "-o", run.folder.name]
+
+
+def _nearest_recipe(config: Config, dag: Dag) -> tuple[str, dict[str, Any]]:
+    """Return the recipe from which the fewest settings differ, and these settings."""
+    settings = dict(flattened(config.document()))
+    candidates = []
+    for recipe in ("default", *(name for name in recipe_names() if name != "default")):
+        from_recipe = dict(flattened(load_config(dag, recipe).document()))
+        changed = {name: value for name, value in settings.items() if from_recipe.get(name) != value}
+        candidates.append((len(changed), recipe, changed))
+    _, recipe, changed = min(candidates, key=lambda item: item[0])
+    return recipe, changed
+
+
+def _set(values: Mapping[str, Any]) -> list[str]:
+    """Return options ``--set NAME=VALUE``."""
+    words = []
+    for name, value in values.items():
+        words += ["--set", f"{name}={value if isinstance(value, str) else toml_text(value)}"]
+    return words
+
+
+def toml_text(value: Any) -> str:
+    """Return ``value`` in TOML, or "unset" for None."""
+    if value is None:
+        return "unset"
+    return " ".join(tomli_w.dumps({"v": value}).removeprefix("v = ").split())
+
+
+def _time(planner: Planner, options: Sequence[str]) -> str:
+    """Return the expected time of the run with ``options``; "" if it is unknown."""
+    given = [
+        f"g0.quality={value}" if option == "--quality" else value
+        for option, value in pairwise(options)
+        if option in ("--set", "--quality")
+    ]
+    kept = "default" if "--reset" in options else planner.run.config.document()
+    try:
+        config = load_config(planner.dag, kept, given)
+        run = replace(planner.run, config=config)
+        changed = Planner(planner.dag, run, planner.store, planner.threads, SilentReporter())
+        costs = [plan.estimate.minutes for plan in changed.plan() if plan.estimate is not None]
+    except CleargsError:  # the capture was deleted or moved
+        return ""
+    return f"about {max(1, round(sum(costs)))} min" if costs else ""
+
+
+class _Advisor:
+    """The advice on one run."""
+
+    def __init__(self, planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> None:
+        self._config, self._dag = planner.run.config, planner.dag
+        self._manifests, self._rows = manifests, rows
+        self._placed = [row for row in rows if row.frame.registered]
+
+    def _figure(self, stage: str, *path: str) -> Any:
+        return figure_of(self._manifests, stage, *path)
+
+    def _setting(self, section: str, name: str) -> Any:
+        return getattr(self._config.sections[section], name)
+
+    def advice(self) -> Iterator[Advice]:
+        """Yield all advice, in the order of the stages."""
+        for manifest in self._manifests.values():
+            for missing in manifest.missing:
+                yield Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
+        yield from self._on_frames()
+        yield from self._on_weights()
+        if "g0" in self._manifests:
+            yield from self._on_training()
+
+    def _on_frames(self) -> Iterator[Advice]:
+        """Yield advice on the frames and their poses."""
+        rows = self._rows
+        unplaced = sum(row.role == UNPLACED for row in rows)
+        available = self._figure("ingest", "frames_available") or 0
+        more: dict[str, Any] = {}  # the setting that limits the number of frames, if the capture has more
+        if available > len(rows):
+            fps = self._setting("ingest", "fps")
+            if fps is not None and len(rows) < self._setting("ingest", "max_frames"):
+                more = {"ingest.fps": 2 * fps}
+            else:
+                more = {"ingest.max_frames": min(available, 2 * len(rows))}
+        if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
+            all_pairs = len(rows) < self._setting("ingest", "exhaustive_below")
+            overlap = {} if all_pairs else {"ingest.overlap": 2 * self._setting("ingest", "overlap")}
+            yield Advice(
+                f"{count(unplaced, 'frame has', 'frames have')} no pose",
+                "They share too few points with their neighbours: they are too blurred or too far apart.",
+                f"up to {count(unplaced, 'frame')} more" if more or overlap else "",
+                5.0,
+                tuple(_set(more | overlap)),
+            )
+        elif available > 1.5 * len(rows):
+            yield Advice(
+                f"{len(rows)} of {available} frames were used",
+                "More frames show each surface from more views.",
+                "+1.8 dB at new views on one capture (292 frames in place of 150)",
+                1.0,
+                tuple(_set(more)),
+            )
+        if rows and not any(row.role == HELD_OUT for row in rows):
+            yield Advice(
+                "No frame was held out",
+                "All figures here are for frames that the scene was trained on.",
+                "no better scene, but a figure for new views",
+                0.0,
+                ("--set", "ingest.holdout=every:8"),
+            )
+
+    def _on_weights(self) -> Iterator[Advice]:
+        """Yield advice on the weights of the frames."""
+        lower = {"rva.tau_R": round(max(self._setting("rva", "tau_R") - 0.1, 0.0), 2)}
+        if self._figure("rva", "stand_in"):
+            higher = {"rva.tau_B": round(min(self._setting("rva", "tau_B") + 0.1, 1.0), 2)}
+            what = "No frame counts as reliable, so the best ones are used"
+            why = "Thresholds closer to the scores of this capture separate good frames from bad ones."
+            yield Advice(what, why, NO_FIGURE, 0.3, tuple(_set(lower | higher)))
+        if uncovered := self._figure("rva", "bins_uncovered_before"):
+            what = f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame"
+            yield Advice(what, "The scene may be softer there. Film more slowly there.", NO_FIGURE, 0.2)
+        weighted = sum(row.weight is not None for row in self._placed)
+        unused = sum(row.weight == 0.0 for row in self._placed)
+        if weighted and unused > MANY_UNUSED * weighted:
+            what, why = f"{unused} of {weighted} placed frames are not used", "A lower threshold uses more."
+            yield Advice(what, why, NO_FIGURE, 0.4, tuple(_set(lower)))
+        blurred = sum((row.motion("blur_px") or 0.0) > BLURRED_PX for row in self._rows)
+        if blurred > len(self._rows) / 2:
+            what = f"{count(blurred, 'frame has', 'frames have')} more than {BLURRED_PX:g} px of motion blur"
+            why = "A shorter exposure or slower camera motion gives sharper frames than any repair."
+            yield Advice(what, why, NO_FIGURE, 0.5)
+
+    def _on_training(self) -> Iterator[Advice]:
+        """Yield advice on the trainings."""
+        yield from self._on_steps()
+        spread = self._figure("g0", "exposure_spread") or 0.0
+        if spread > self._setting("g0", "exposure_threshold") and not self._figure("g0", "exposure"):
+            what = f"Exposure differs by {100 * spread:.0f} % between frames"
+            why = "Without compensation the scene averages the exposures, which causes floating haze."
+            yield Advice(what, why, NO_FIGURE, 0.8, tuple(_set({"g0.exposure": "auto"})))
+
+    def _on_steps(self) -> Iterator[Advice]:
+        """Yield advice on the length of the training and the size of the images."""
+        steps, quality = self._figure("g0", "steps") or 0, self._setting("g0", "quality")
+        standard = steps_from_frames(sum(bool(row.weight) for row in self._rows))
+        size = self._setting("ingest", "max_size")
+        recipe, changed = _nearest_recipe(self._config, self._dag)
+        named = self._setting("g0", "steps") is not None or recipe != "default"
+        if steps < SHORT * standard:
+            own = {name: value for name, value in changed.items() if name.startswith(("ingest.", "rva."))}
+            reset = ("--reset", *_set(own)) if named else ()
+            yield Advice(
+                f"The training was short: {steps:,} of {standard:,} steps at {size} px",
+                "Longer training gives finer detail.",
+                "+0.8 to 2.2 dB at new views (draft against standard, four captures)",
+                1.5,
+                (*reset, "--quality", "standard"),
+            )
+        elif quality == "standard" and not named:
+            yield Advice(
+                "The training can be longer",
+                "High quality takes four times the steps and twice the Gaussians.",
+                "+0.4 to 0.9 dB at new views on three captures, none on a fourth",
+                0.6,
+                ("--quality", "high"),
+            )
+        if steps >= SHORT * standard and any(
+            size in (row.frame.width, row.frame.height) for row in self._rows
+        ):
+            why = "Larger images show finer detail, if the video has it."
+            larger = tuple(_set({"ingest.max_size": size * 3 // 2}))
+            yield Advice(f"Images were reduced to {size} px", why, NO_FIGURE, 0.5, larger)

@@ -1,0 +1,54 @@
+"""A report as one HTML file, with its images, its scene and the 3D viewer inside."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+
+from cleargs.files import write_bytes
+
+_SCRIPTS = ("viewer.js", "scene.js")
+_DATA = '<script type="application/json" id="data">'  # the scripts and images are put in front of it
+_BASE64 = 4 / 3  # size ratio
+
+
+def single_file_size(folder: Path) -> int:
+    """Return about how many bytes the report in ``folder`` takes as one file, without its text."""
+    images = sum(file.stat().st_size for file in folder.rglob("*.jpg"))
+    scripts = sum((folder / name).stat().st_size for name in _SCRIPTS if (folder / name).is_file())
+    return round(_BASE64 * images) + scripts
+
+
+def write_single_file(page: Path, target: Path) -> int:
+    """Write the report at ``page`` as one HTML file, and return its size in bytes.
+
+    Images that the page shows at once replace their links. Others are in the object ``window.files``.
+
+    Raises:
+        StoreError: if the file cannot be written.
+    """
+    folder = page.parent
+    images = {
+        file.relative_to(folder).as_posix(): "data:image/jpeg;base64," + _base64(file)
+        for file in sorted(folder.rglob("*.jpg"))
+    }
+    html, shown = page.read_text(encoding="utf-8"), set()
+
+    def with_content(link: re.Match[str]) -> str:
+        shown.add(link[1])
+        return f' src="{images[link[1]]}"' if link[1] in images else link[0]
+
+    html = re.sub(r' src="([^"]+)"', with_content, html.replace("<html ", "<html data-single ", 1))
+    others = {name: image for name, image in images.items() if name not in shown}
+    scripts = [(folder / name).read_text() for name in _SCRIPTS if (folder / name).is_file()]
+    scripts.append(f"window.files = {json.dumps(others)};")
+    inside = "".join(f"<script>{script}</script>\n" for script in scripts)
+    data = html.replace(_DATA, inside + _DATA, 1).encode()
+    write_bytes(target, data)
+    return len(data)
+
+
+def _base64(file: Path) -> str:
+    return base64.b64encode(file.read_bytes()).decode()

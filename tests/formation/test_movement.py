@@ -1,0 +1,151 @@
+"""Regions of a frame that the scene of the other frames does not explain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from cleargs.formation.movement import Movement, read_movement, regions, still_pixels, write_movement
+from cleargs.splat.camera import Camera
+from cleargs.splat.types import Render
+
+HEIGHT, WIDTH, FRAMES = 108, 192, 6
+DEPTH, STEP = 4.0, 0.1
+"""Distance of the wall that all cameras look at, and between two cameras."""
+
+
+def picture() -> Tensor:
+    """Coloured squares of four pixels, [H, W, 3] sRGB."""
+    coarse = np.random.default_rng(0).uniform(0.2, 0.8, (HEIGHT // 4, WIDTH // 4, 3)).astype(np.float32)
+    return torch.from_numpy(cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST))
+
+
+def disc(x: float = 60, y: float = 50, radius: float = 20) -> Tensor:
+    columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    return torch.from_numpy(np.hypot(columns - x, rows - y) < radius)
+
+
+def with_disc(where: Tensor) -> Tensor:
+    seen = picture()
+    seen[where] = torch.tensor([0.9, 0.1, 0.1])
+    return seen
+
+
+def movement(apart: float = STEP, tolerance: float = 0.05) -> Movement:
+    cameras = {}
+    for k in range(FRAMES):
+        pose = np.eye(4)
+        pose[0, 3] = -apart * k
+        cameras[k] = Camera(WIDTH, HEIGHT, 160.0, 160.0, WIDTH / 2, HEIGHT / 2, pose)
+    return Movement(cameras, tolerance)
+
+
+def look(
+    found: Movement, frame_id: int, target: Tensor, mask: Tensor | None = None, shown: Tensor | None = None
+) -> None:
+    """Compare a frame with a wall that shows `picture`."""
+    image = picture() if shown is None else shown
+    alpha = torch.ones(HEIGHT, WIDTH)
+    found.look(frame_id, image, Render(image, alpha, DEPTH * alpha), 0, target, mask)
+
+
+def looked(targets: dict[int, Tensor], found: Movement | None = None) -> Movement:
+    """Look at all frames, twice, since the first look at a frame has no witnesses."""
+    found = found or movement()
+    for _ in range(2):
+        for k in range(FRAMES):
+            look(found, k, targets.get(k, picture()))
+    return found
+
+
+def still(found: Movement, frame_id: int, mask: Tensor | None = None) -> Tensor | None:
+    return found.still(frame_id, mask, picture())
+
+
+def test_noise_blur_and_another_exposure_are_not_movement() -> None:
+    noise = 2 / 255 * torch.from_numpy(np.random.default_rng(1).standard_normal(picture().shape)).float()
+    soft = torch.from_numpy(cv2.GaussianBlur(picture().numpy(), (0, 0), 1.0))
+    found = looked({0: picture() + noise, 1: soft, 2: 0.8 * picture()})
+    assert found.masks() == {}
+    mask = disc()
+    assert still(found, 0) is None and still(found, 0, mask) is mask
+
+
+def test_a_thing_in_one_frame_does_not_count_and_the_rest_does() -> None:
+    found = looked({2: with_disc(disc())})
+    assert list(found.masks()) == [2]
+    counts = still(found, 2)
+    assert counts is not None and not counts[disc()].any()
+    # Cells have 6 pixels. The region's border is one cell wide.
+    assert counts[~disc(radius=20 + 20)].all()
+    mask = disc(150)
+    both = still(found, 2, mask)
+    assert both is not None and torch.equal(both, counts & mask)
+
+
+def test_what_most_frames_show_at_the_same_place_is_not_movement() -> None:
+    shift = 160.0 * STEP / DEPTH  # px between two frames
+    targets = {k: with_disc(disc(80 - shift * k)) for k in range(FRAMES)}
+    assert looked(targets).masks() == {}
+    assert sorted(looked({k: targets[k] for k in (0, 5)}).masks()) == [0, 5]
+
+
+def test_a_place_that_no_other_frame_sees_is_not_movement() -> None:
+    # The cameras are 8 m apart, and each sees 4.8 m of the wall.
+    assert looked({2: with_disc(disc())}, movement(apart=8.0)).masks() == {}
+
+
+def test_nothing_moves_with_the_tolerance_0() -> None:
+    assert movement().due(3, 0.5) and not movement().due(4, 0.5) and not movement().due(3, 0.0)
+    assert not movement(tolerance=0.0).due(3, 0.5)
+
+
+def test_masked_pixels_play_no_part() -> None:
+    found = looked({})
+    look(found, 2, with_disc(disc()), ~disc(radius=21))
+    assert found.masks() == {}
+    look(found, 2, with_disc(disc()), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool))
+    assert found.masks() == {}
+
+
+def test_a_small_spot_is_not_a_region() -> None:
+    cells = np.zeros((18, 32), np.bool_)
+    cells[4:6, 4:6] = True
+    assert not regions(cells).any()
+    cells[10:13, 10:13] = True
+    found = regions(cells)
+    assert found[9:14, 9:14].all() and found.sum() == 25
+
+
+def test_state_and_table_return_the_same(tmp_path: Path) -> None:
+    found = looked({2: with_disc(disc()), 4: with_disc(disc(120))})
+    again = movement()
+    again.restore(found.state())
+    look(found, 2, with_disc(disc(70)))
+    look(again, 2, with_disc(disc(70)))
+    write_movement(tmp_path / "movement.parquet", found.masks())
+    read = read_movement(tmp_path / "movement.parquet")
+    assert read.keys() == found.masks().keys() == again.masks().keys() == {2, 4}
+    for k in read:
+        np.testing.assert_array_equal(read[k], found.masks()[k])
+        np.testing.assert_array_equal(again.masks()[k], found.masks()[k])
+
+
+def test_a_later_training_begins_with_the_masks_and_follows_its_own_looks() -> None:
+    first = looked({2: with_disc(disc())})
+    later = Movement(dict(enumerate(first._cameras)), 0.05, first.masks())
+    look(later, 2, with_disc(disc()))  # without witnesses
+    np.testing.assert_array_equal(later.masks()[2], first.masks()[2])
+    assert looked({}, later).masks() == {}
+
+
+@pytest.mark.parametrize("factor", [1, 3])
+def test_the_size_of_the_frame_does_not_matter(factor: int) -> None:
+    cells = regions(np.pad(np.ones((4, 4), np.bool_), ((5, 9), (8, 20))))
+    small, large = still_pixels(cells, 36, 64), still_pixels(cells, 36 * factor, 64 * factor)
+    np.testing.assert_array_equal(large[::factor, ::factor], small)
