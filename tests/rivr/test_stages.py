@@ -283,7 +283,7 @@ def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest
     kept = {(row.round, row.frame_id) for row in rows if row.chosen == "observed"}
     sharp = {k for k in TARGETS if ROLES[k] == "strong"}
     assert {k for n, k in kept if n == 1} == sharp
-    # A toy training of few steps learns some of the blur, so that in the second round a frame may need no repair.
+    # A toy training of few steps learns some of the blur. In the second round a frame may need no repair.
     last = {k for n, k in kept if n == 2}
     assert sharp <= last
     for row in rows:
