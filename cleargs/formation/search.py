@@ -146,7 +146,7 @@ def _best(
 ) -> FrameMotion:
     """Return the best end of the descents from ``starts`` with a path of ``order``.
 
-    A pose that is not corrected is that at the middle of the exposure. Where the path bends, the mean pose is
+    A pose that is not corrected is that at the middle of the exposure. If the path bends, the mean pose is
     a twelfth of the bend away from it.
     """
     bends = order > 1

@@ -92,7 +92,9 @@ def test_every_variant_is_evaluated_on_both_view_sets(out: Path) -> None:
         assert (out / cell["evaluation"] / "eval.json").is_file()
         assert (cell["steps"], cell["sh_degree"]) == (TOTAL, 1)
         assert cell["cpu_seconds"] > 0.0 and 0.05 < cell["peak_memory_gb"] < 10.0
-    assert len({cell["gaussians"] for cell in cells.values()}) == 1
+    # All grow to the same budget. The end of G0 then removes floaters, here at most 2 of 500.
+    counts = [cell["gaussians"] for cell in cells.values()]
+    assert max(counts) - min(counts) <= 0.02 * max(counts)
     assert cells["rva", "observed"]["evaluation"] != cells["all-view", "observed"]["evaluation"]
     for name in ("comparison.md", "comparison.png", "sheet.png"):
         assert (out / name).stat().st_size > 0
