@@ -37,6 +37,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import LOG, make_reporter
 from cleargs.cli.report import outdated_report_note, write_run_report
+from cleargs.errors import StageError
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
@@ -50,6 +51,7 @@ from cleargs.pipeline.session import (
     usable_cores,
 )
 from cleargs.pipeline.settings import flattened
+from cleargs.progress import SilentReporter
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import ENTRY
 from cleargs.safe_io import printable
@@ -250,8 +252,16 @@ _RUN = run  # the command, whose name is an argument below
 @quiet_option
 @click.pass_context
 def stage(context: click.Context, /, name: str, run: Path, force: bool, **options: Any) -> int:
-    """Run the stage NAME of an existing RUN, and the stages before it that are missing."""
-    read_run_file(run, context.obj)
+    """Run the stage NAME of an existing RUN. All stages before it must be done."""
+    settings = read_run_file(run, context.obj, store=options["store"])
+    with opened_store(settings.store) as opened:
+        planner = Planner(context.obj, settings, opened, options["threads"], SilentReporter())
+        *before, _ = planner.plan(context.obj.check(name))
+    enough = ("done", "partial") if options["allow_partial"] else ("done",)
+    if needed := next((plan for plan in before if plan.state not in enough), None):
+        state = "done only in part" if needed.state == "partial" else "not done"
+        remedy = f"run first: cleargs stage {needed.stage} {quote(str(run))}"
+        raise StageError(f"{name} needs {needed.stage}, which is {state}", hint=remedy)
     options |= {"source": run, "until": name, "force": (name,) if force else ()}
     return int(context.invoke(_RUN, **options))
 

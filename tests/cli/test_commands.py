@@ -182,6 +182,9 @@ def test_status_and_stage(shell: Shell) -> None:
     assert json.loads(shell("status", folder, "--json")[1])[0]["state"] == "missing"
     assert shell("explain", folder) == shell("status", folder), "the old name"
     assert "explain" not in shell("--help")[1]
+    code, _, err = shell("stage", "total", folder)
+    assert code == 1 and "error: total needs count, which is not done" in err
+    assert shell("stage", "count", folder)[0] == 0
     assert shell("stage", "square", folder, "--threads", "1")[0] == 0
     states = [one["state"] for one in json.loads(shell("status", folder, "--json")[1])]
     assert states == ["done", "done", "missing"]
