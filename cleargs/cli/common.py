@@ -105,7 +105,7 @@ def kept_log(context: click.Context, path: Path, *, writes: bool) -> Iterator[Sa
     Yields a function for details, which are shown only with ``-v``.
     """
     chosen: Say | None = context.meta.get(LOG)
-    file = LineFile(path, beside=RUN_FILE)  # nothing is written into a folder that is not a run
+    file = LineFile(path, needed=RUN_FILE)  # nothing is written into a folder that is not a run
 
     def log(text: str) -> None:
         if chosen is not None:

@@ -55,14 +55,14 @@ def make_reporter(quiet: bool = False) -> Reporter:
 
 
 class LineFile:
-    """A text file that grows by lines with the time. Lines wait until the file ``beside`` it exists."""
+    """A text file that grows by lines with the time. Lines wait until its folder has the file ``needed``."""
 
-    def __init__(self, path: Path, beside: str = ".") -> None:
-        self.path, self._beside, self._waiting = path, path.parent / beside, [""]
+    def __init__(self, path: Path, needed: str = ".") -> None:
+        self.path, self._needed, self._waiting = path, path.parent / needed, [""]
 
     def __call__(self, text: str) -> None:
         self._waiting.append(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}")
-        if self._beside.exists():
+        if self._needed.exists():
             with disk_errors(self.path), self.path.open("a", encoding="utf-8") as file:
                 file.writelines(f"{line}\n" for line in self._waiting)
             self._waiting.clear()
