@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.comparison.cells import Cell, Cells
-from benchmarks.comparison.pictures import _find_image, plot_comparison
+from benchmarks.comparison.pictures import find_image, plot_comparison
 from benchmarks.comparison.variants import VARIANTS
 from cleargs.media.image import write_rgb
 
@@ -66,6 +66,6 @@ def test_image_is_found_by_its_exact_name(tmp_path: Path) -> None:
     for name, level in (("b.png", 51), ("b.2.png", 255)):
         write_rgb(tmp_path / name, np.full((4, 4, 3), level, np.uint8))
     (tmp_path / "b.AAE").write_text("metadata of a phone")
-    found = _find_image(tmp_path, "b")
+    found = find_image(tmp_path, "b")
     assert found is not None and np.allclose(found, 0.2)
-    assert _find_image(tmp_path, "b.1") is None and _find_image(tmp_path / "nowhere", "b") is None
+    assert find_image(tmp_path, "b.1") is None and find_image(tmp_path / "nowhere", "b") is None
