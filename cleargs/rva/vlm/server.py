@@ -7,24 +7,25 @@ error messages never contain the key.
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from pathlib import Path
 from threading import Event
 from typing import Any
 
+import cv2
 import httpx2
 
 from cleargs.errors import InputError, StageError
 from cleargs.rva.config import QwenConfig, check_base_url
-from cleargs.rva.vlm.evaluator import EncodedImage, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
-from cleargs.types import ArrayF64
+from cleargs.types import ArrayF64, ImageU8
 
 URL_VARIABLE = "CLEARGS_VLM_URL"
 KEY_VARIABLE = "CLEARGS_VLM_API_KEY"
@@ -46,6 +47,24 @@ _RESPONSE_FORMAT = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class EncodedImage:
+    """Image that the model gets."""
+
+    rgb: ImageU8  # [h, w, 3] sRGB
+    masked: bool
+    """True if parts are painted grey."""
+
+    def data_url(self) -> str:
+        """Return the image as the data URL of a PNG. A lossy format would add artifacts."""
+        _, png = cv2.imencode(".png", cv2.cvtColor(self.rgb, cv2.COLOR_RGB2BGR))
+        return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
+
+
+class UnscoredError(Exception):
+    """No valid scores for one frame, with the reason. Other frames may still be scored."""
+
+
 class RefusedError(UnscoredError):
     """The server refuses the request (400, 413, 422 and similar)."""
 
@@ -60,14 +79,12 @@ class TransientError(UnscoredError):
         """True if no server listens at the address."""
 
 
-class QwenServer(QwenEvaluator):
+class QwenServer:
     """Sends chats to ``BASE/chat/completions``."""
 
-    def __init__(self, config: QwenConfig, *, seed: int, cache: Path | None) -> None:
+    def __init__(self, config: QwenConfig, *, seed: int) -> None:
         """Read the address and the key. Raise InputError if one of them is invalid."""
-        identity = json.dumps(["server", config.model, config.max_tokens, seed])
-        super().__init__(config, model=config.model, identity=identity, cache=cache)
-        self.workers = config.concurrency
+        self._config = config
         self._url = (config.base_url or os.environ.get(URL_VARIABLE, "").strip() or DEFAULT_URL).rstrip("/")
         try:
             check_base_url(self._url)
@@ -127,10 +144,12 @@ class QwenServer(QwenEvaluator):
                 hint=f"choose one with --set rva.qwen.model=NAME, or serve {model}",
             )
 
-    def score(self, image: EncodedImage) -> ArrayF64:
-        """Return the cues of one image; see `QwenEvaluator.score`.
+    def score(self, image: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
+        """Return the cues of one image.
 
         After an invalid reply the model gets the error and is asked again, up to ``asks`` times in all.
+
+        Raises UnscoredError if this image gets no scores, and StageError if no image would get scores.
         """
         if self._abandoned:
             raise UnscoredError(self._abandoned)  # do not wait for the same error again
