@@ -45,24 +45,12 @@ class QwenConfig(Settings):
     )
     prompt: ClassVar[int] = 1
     """Version of the prompt; part of the evaluator's name in the table."""
-    image_size: int = Field(
-        1024, ge=64, le=4096, description="px; larger images are reduced to this long side"
-    )
     max_tokens: int = Field(1024, ge=64, le=32_768, description="maximum length of a reply, in tokens")
     concurrency: Annotated[int, _NOT_IN_KEY] = Field(
         4, ge=1, le=256, description="maximum number of requests at the same time"
     )
     timeout_s: Annotated[float, _NOT_IN_KEY] = Field(
         120.0, gt=0.0, le=3600.0, description="maximum wait for one reply"
-    )
-    attempts: Annotated[int, _NOT_IN_KEY] = Field(
-        5, ge=1, le=100, description="tries of one request if the server is busy, fails or does not answer"
-    )
-    backoff_s: Annotated[float, _NOT_IN_KEY] = Field(
-        1.0, ge=0.0, le=60.0, description="pause before the second try; doubled before each further try"
-    )
-    asks: Annotated[int, _NOT_IN_KEY] = Field(
-        3, ge=1, le=20, description="questions per frame if the replies do not match the schema"
     )
 
 

@@ -21,6 +21,7 @@ from cleargs.rva.vlm.server import EncodedImage, QwenServer, UnscoredError
 from cleargs.types import ArrayF64
 
 _MASKED = 127  # mid-grey, as the prompt says
+_LONG_SIDE = 1024  # px; larger images are reduced to it
 
 
 class QwenEvaluator:
@@ -40,7 +41,7 @@ class QwenEvaluator:
         self._config = config
         self._server = QwenServer(config, seed=seed)
         identity = json.dumps(["server", config.model, config.max_tokens, seed])
-        facts = [identity, self.version, config.image_size]
+        facts = [identity, self.version, _LONG_SIDE]
         self._cache = ItemCache(cache, CUE_COLUMNS, facts, bounds=(0.0, 1.0))
 
     def check(self) -> None:
@@ -83,4 +84,4 @@ class QwenEvaluator:
         if mask is not None:
             rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
         masked = mask is not None and not mask.all()
-        return self._server.score(EncodedImage(downscale(rgb, self._config.image_size), masked))
+        return self._server.score(EncodedImage(downscale(rgb, _LONG_SIDE), masked))

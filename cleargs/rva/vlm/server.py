@@ -33,7 +33,10 @@ DEFAULT_URL = "http://127.0.0.1:8000/v1"
 
 _RETRY_STATUSES = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
 _MALFORMED = (ValueError, LookupError, TypeError, RecursionError)
+_ATTEMPTS = 5  # tries of one request if the server is busy, fails or does not answer
+_PAUSE_S = 1.0  # s before the second try; doubled before each further try
 _MAX_PAUSE_S = 120.0  # s between tries; also limits Retry-After
+_ASKS = 3  # questions per frame if the replies do not match the schema
 _MAX_REPLY_BYTES = 4 << 20
 _MAX_CHECK_S = 10.0  # s to wait for the list of models
 _MAX_QUOTED = 200  # characters of the server's text in a message
@@ -147,7 +150,7 @@ class QwenServer:
     def score(self, image: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
         """Return the cues of one image.
 
-        After an invalid reply the model gets the error and is asked again, up to ``asks`` times in all.
+        After an invalid reply the model gets the error and is asked again, up to `_ASKS` times in all.
 
         Raises UnscoredError if this image gets no scores, and StageError if no image would get scores.
         """
@@ -159,7 +162,7 @@ class QwenServer:
         ]
         question: dict[str, Any] = {"role": "user", "content": content}
         messages, fault = [question], ""
-        for _ in range(self._config.asks):
+        for _ in range(_ASKS):
             reply = self._reply(messages)
             try:
                 return parse_reply(reply)
@@ -171,7 +174,7 @@ class QwenServer:
                 {"role": "assistant", "content": reply[:_MAX_REPEATED]},
                 {"role": "user", "content": complaint},
             ]
-        raise UnscoredError(f"the last of {self._config.asks} replies is invalid: {fault}")
+        raise UnscoredError(f"the last of {_ASKS} replies is invalid: {fault}")
 
     def _reply(self, messages: list[dict[str, Any]]) -> str:
         """Return the model's text, constrained to the schema if the server supports that."""
@@ -189,13 +192,13 @@ class QwenServer:
         Raises UnscoredError if this chat gets no reply, and StageError if no chat would get one: wrong key,
         model or address.
         """
-        pause, tried = self._config.backoff_s, 0
+        pause, tried = _PAUSE_S, 0
         while True:
             try:
                 return self._try_once(body)
             except TransientError as fault:
                 tried += 1
-                last = tried == self._config.attempts
+                last = tried == _ATTEMPTS
                 if last or self._stopped.wait(min(_MAX_PAUSE_S, max(pause, fault.after))):
                     reason = f"{fault} ({tried} tries)"
                     self._abandoned = reason if fault.unreachable else self._abandoned
