@@ -46,6 +46,10 @@ MAX_ORDER = 3
 ORDER_PENALTY = 0.005
 """Share of the misfit without any motion that each further order of the path must explain to be preferred."""
 
+BEND_SHARE = 0.01
+"""Share of the difference that a straight path must explain at a size before bent ones are tried there. Most
+frames are sharp, and a bent path has three times the unknowns of a straight one."""
+
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
 
@@ -81,11 +85,12 @@ def search(
         straight = curved = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
             straight = _best(level, [straight, still], model, steps, pose)
-            if BLUR in _ACTIVE[model] and level is not levels[-1]:
+            bends = BLUR in _ACTIVE[model] and _explains(level, straight, still)
+            if bends and level is not levels[-1]:
                 start = min(straight, curved, key=level.cost)
                 curved = _best(level, [start], model, steps, pose, MAX_ORDER)
         found.append((model, straight))
-        if straight.blur.any() or curved.blur.any():
+        if bends or curved.order > 1:
             paths = _curved(levels[-1], straight, curved, model, LEVELS[len(levels) - 1][1], pose)
             found += [(model, path) for path in paths]
     if defocus:
@@ -132,6 +137,11 @@ def preferred(found: list[MotionFit]) -> MotionFit:
         return model + ORDER_PENALTY * fit.misfit_still * (fit.motion.order - 1)
 
     return min(found, key=cost)
+
+
+def _explains(level: Level, motion: FrameMotion, still: FrameMotion) -> bool:
+    """Return True if ``motion`` explains enough at this size for a bent path to be tried."""
+    return level.cost(motion) < (1.0 - BEND_SHARE) * level.cost(still)
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
