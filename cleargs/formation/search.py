@@ -47,8 +47,8 @@ ORDER_PENALTY = 0.005
 """Share of the misfit without any motion that each further order of the path must explain to be preferred."""
 
 BEND_SHARE = 0.01
-"""Share of the difference that a straight path must explain at a size before bent ones are tried there. Most
-frames are sharp, and a bent path has three times the unknowns of a straight one."""
+"""Share of the difference that a path must explain at a size before a cubic one is tried there. Most frames
+are sharp, and a cubic path has four times the unknowns of a straight one."""
 
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
@@ -85,13 +85,14 @@ def search(
         straight = curved = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
             straight = _best(level, [straight, still], model, steps, pose)
-            bends = BLUR in _ACTIVE[model] and _explains(level, straight, still)
-            if bends and level is not levels[-1]:
-                start = min(straight, curved, key=level.cost)
+            if level is levels[-1] or BLUR not in _ACTIVE[model]:
+                continue
+            start = min(straight, curved, key=level.cost)
+            if _explains(level, start, still):
                 curved = _best(level, [start], model, steps, pose, MAX_ORDER)
         found.append((model, straight))
-        if bends or curved.order > 1:
-            paths = _curved(levels[-1], straight, curved, model, LEVELS[len(levels) - 1][1], pose)
+        if straight.blur.any() or curved.blur.any():
+            paths = _curved(levels[-1], [straight, curved, still], model, LEVELS[len(levels) - 1][1], pose)
             found += [(model, path) for path in paths]
     if defocus:
         disc = _sharpest_disc(coarse, still)
@@ -140,7 +141,7 @@ def preferred(found: list[MotionFit]) -> MotionFit:
 
 
 def _explains(level: Level, motion: FrameMotion, still: FrameMotion) -> bool:
-    """Return True if ``motion`` explains enough at this size for a bent path to be tried."""
+    """Return True if ``motion`` explains enough at this size for a cubic path to be tried."""
     return level.cost(motion) < (1.0 - BEND_SHARE) * level.cost(still)
 
 
@@ -172,11 +173,17 @@ def _best(
 
 
 def _curved(
-    level: Level, straight: FrameMotion, curved: FrameMotion, model: Model, steps: int, pose: bool
+    level: Level, paths: list[FrameMotion], model: Model, steps: int, pose: bool
 ) -> list[FrameMotion]:
-    """Return the quadratic and the cubic path at the finest level, from those of the levels before."""
+    """Return the quadratic path at the finest level, and the cubic one where it may explain more.
+
+    ``paths`` are the straight one, that of the levels before, and none.
+    """
+    straight, curved, still = paths
     quadratic = _best(level, [straight], model, steps, pose, 2)
     start = min(quadratic, curved, key=level.cost)
+    if not _explains(level, start, still):
+        return [quadratic]
     return [quadratic, _best(level, [start], model, steps, pose, MAX_ORDER)]
 
 
