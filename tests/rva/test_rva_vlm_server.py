@@ -290,7 +290,7 @@ def test_a_damaged_cache_file_is_replaced(bench: Bench) -> None:
 
 def test_cached_scores_are_for_the_same_question_only(bench: Bench) -> None:
     with vlm_server() as log:
-        for settings in ({}, {"model": "other"}, {"image_size": 64}, {"concurrency": 1}):
+        for settings in ({}, {"model": "other"}, {"max_tokens": 64}, {"concurrency": 1}):
             bench.run(log.url, **settings)
     assert len(log.requests) == 3 * FRAMES
 
