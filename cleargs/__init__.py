@@ -1,6 +1,7 @@
 """ClearGS: clean 3D Gaussian Splatting scenes from handheld videos of mixed quality."""
 
 from importlib import import_module
+from warnings import warn
 
 __version__ = "0.2.0"
 
@@ -23,8 +24,14 @@ _HOMES = {
 }
 __all__ = list(_HOMES)
 
+# Former name -> present name. A former name works for one release.
+_RENAMED = {"View": "TrainingView"}
+
 
 def __getattr__(name: str) -> object:
+    if name in _RENAMED:
+        warn(f"cleargs.{name} is now cleargs.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
+        name = _RENAMED[name]
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -28,5 +28,7 @@ from cleargs.splat.views import TrainingView as TrainingView
 from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]
 from cleargs.synth.synthetic_capture import make_capture as make_capture
 
+View = TrainingView  # former name
+
 __all__: list[str]
 __version__: str

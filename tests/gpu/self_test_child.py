@@ -22,11 +22,12 @@ SMALL = Sizes(
         "a large view": View(150, 40, 20, 2.0),
     },
     image=(6, 50),
+    refined=2000,
     timed=View(20, 16, 16),
     repeats=4,
 )
 
-ONE_CHECK = SMALL._replace(views={})
+ONE_CHECK = SMALL._replace(views={}, refined=40)
 """Without the rendering, which takes most of the time in the interpreter."""
 
 

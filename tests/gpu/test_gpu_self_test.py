@@ -33,7 +33,7 @@ def in_child(fault: str, **options: Any) -> SelfTest:
 def test_the_interpreter_passes(cache: Path) -> None:
     tested = in_child("pass")
     assert tested.fault is None, tested.lines()
-    assert len(tested.checks) == 6
+    assert len(tested.checks) == 8
     assert all(check.seconds for check in tested.checks)
     assert gpu.cached_test(FACTS) == tested
     assert gpu.cached_test({**FACTS, "driver": "another"}) is None
@@ -63,8 +63,9 @@ def run(
 
     from cleargs.splat.kernels.cuda import self_test
 
-    def run(device: str = str(device)) -> SelfTest:
-        monkeypatch.setattr(self_test, "step_ms", lambda *given: 2.0)  # it takes half a minute
+    def run(device: str = str(device), *, timed: bool = False) -> SelfTest:
+        if not timed:  # it takes half a minute in the interpreter
+            monkeypatch.setattr(self_test, "iterate", lambda *given: (2.0, 0))
         capsys.readouterr()
         self_test.main(device, self_test_child.ONE_CHECK)
         return gpu.read_result(FACTS, capsys.readouterr().out)
@@ -113,6 +114,12 @@ def test_values_that_are_not_finite(run: Callable[..., SelfTest], monkeypatch: p
 
     monkeypatch.setattr(backend, "apply_affine", lambda image, affine: image * float("nan"))
     assert run().fault == "loss and colour: colour affine: has values that are not finite"
+
+
+def test_a_memory_that_grows(run: Callable[..., SelfTest], monkeypatch: pytest.MonkeyPatch) -> None:
+    held = itertools.count(100, 512)
+    monkeypatch.setattr("cleargs.splat.kernels.cuda.self_test.allocated", lambda device: next(held))
+    assert run(timed=True).fault == "memory: grows by 512 bytes in 4 training steps"
 
 
 def test_a_full_memory_is_not_kept(run: Callable[..., SelfTest], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,6 +50,8 @@ class Sizes(NamedTuple):
     views: dict[str, View]
     image: tuple[int, int] = (723, 1283)
     """Height and width of the images of loss and warp, px."""
+    refined: int = 20_000
+    """Gaussians of the refinement and of the noise."""
     timed: View = View(50_000, 640, 360)
     repeats: int = 20
     """Training steps that are timed."""
@@ -94,6 +96,12 @@ def as_gradient(found: Tensor, expected: Tensor) -> str | None:
     """Compare gradients: their difference has at most 1e-3 of their norm."""
     error = float((found - expected).double().norm() / expected.double().norm().clamp(min=1e-30))
     return f"differs by {error:.2g} of its norm" if error > 1e-3 else None
+
+
+def as_sample(found: Tensor, expected: Tensor) -> str | None:
+    """Compare random draws by their standard deviation: the back ends draw different numbers."""
+    ratio = float(found.double().std() / expected.double().std())
+    return f"has {ratio:.2g} times the standard deviation" if abs(ratio - 1.0) > 0.1 else None
 
 
 def _random(*shape: int, device: torch.device) -> Tensor:
@@ -186,6 +194,39 @@ def warp(size: tuple[int, int], backend: Backend, device: torch.device) -> Resul
     }
 
 
+def refinement(count: int, backend: Backend, device: torch.device) -> Results:
+    """Run a refinement without draws, one with draws, and the noise on the means."""
+    results = Results()
+    for number, drawn in ((40, False), (count, True)):
+        gaussians, _ = View(number, 64, 48).scene(device)
+        gaussians.logit_opacities[:] = torch.linspace(-8.0, 3.0, number).to(device)
+        errors = torch.linspace(0.0, 1.0, number).to(device)
+        if not drawn:  # There is a place for each half of these two: no draw decides.
+            errors[:] = 0.0
+            errors[[20, 33]] = 2.0
+        grown, _ = backend.refine(
+            gaussians,
+            Moments.zeros(gaussians),
+            errors=errors,
+            rate=0.5,
+            budget=number + number * 17 // 40,
+            min_opacity=0.01,
+            seed=(1,),
+        )
+        if drawn:
+            results["means after draws"] = (grown.means, as_sample)
+        else:
+            order = grown.means.double().sum(dim=1).sort(stable=True).indices
+            results |= {name: (tensor[order], within(1e-4)) for name, tensor in grown.tensors().items()}
+    crowd = View(1, 64, 48).scene(device)[0].select(torch.zeros(count, dtype=torch.int64, device=device))
+    crowd.logit_opacities[:] = -9.0
+    crowd.logit_opacities[: count // 2] = 2.0
+    before = crowd.means.clone()
+    backend.add_position_noise(crowd, amount=2.0, min_opacity=0.005, seed=(11,))
+    results["opaque Gaussians after noise"] = (crowd.means[: count // 2], within(0.0))
+    return results | {"noise": ((crowd.means - before)[count // 2 :], as_sample)}
+
+
 def checks(sizes: Sizes) -> dict[str, Run]:
     """Return the checks by name, in the order in which they run."""
     return {
@@ -193,6 +234,7 @@ def checks(sizes: Sizes) -> dict[str, Run]:
         "loss and colour": partial(loss, sizes.image),
         "Adam": partial(adam, sizes.timed),
         "motion blur and defocus": partial(warp, sizes.image),
+        "refinement": partial(refinement, sizes.refined),
     }
 
 
@@ -211,15 +253,15 @@ def faults(run: Run, gpu: Backend, cpu: Backend, device: torch.device) -> Iterat
             yield f"{name}: has different bits in two runs on the GPU"
 
 
-# -- pace --------------------------------------------------------------------------------------------------
+# -- pace and memory ---------------------------------------------------------------------------------------
 
 
-def step_ms(view: View, repeats: int, backend: Backend, device: torch.device) -> float:
-    """Return the milliseconds of the fastest of ``repeats`` training steps, after three others."""
+def iterate(view: View, repeats: int, backend: Backend, device: torch.device) -> tuple[float, int]:
+    """Return the milliseconds of the fastest training step after three, and the growth of memory in bytes."""
     gaussians, camera = view.scene(device)
     target = _random(view.height, view.width, 3, device=device)
     slope, moments, engine = torch.empty_like(target), Moments.zeros(gaussians), backend.rasteriser(device)
-    times = []
+    times, held = [], 0
     for step in range(1, repeats + 4):
         start = time.perf_counter()
         image = engine.forward(gaussians, camera).image
@@ -229,7 +271,8 @@ def step_ms(view: View, repeats: int, backend: Backend, device: torch.device) ->
             backend.adam_step(getattr(gaussians, name), gradient, first, second, step, 0.0)
         float(gaussians.means[0, 0])  # waits for the device
         times.append(1e3 * (time.perf_counter() - start))
-    return min(times[3:])
+        held = torch.cuda.memory_allocated() if step <= 3 else held
+    return min(times[3:]), torch.cuda.memory_allocated() - held
 
 
 def main(device: str = "cuda", sizes: Sizes = FULL) -> None:
@@ -253,9 +296,11 @@ def main(device: str = "cuda", sizes: Sizes = FULL) -> None:
             found = list(faults(run, gpu, cpu, on))
             say(check=name, faults=found, seconds=time.perf_counter() - start)
             start = time.perf_counter()
-        say(starts="the pace of a training step")
-        gpu_ms = step_ms(sizes.timed, sizes.repeats, gpu, on)
-        cpu_ms = step_ms(sizes.timed, sizes.repeats // 4, cpu, torch.device("cpu"))
+        say(starts="memory")
+        gpu_ms, growth = iterate(sizes.timed, sizes.repeats, gpu, on)
+        cpu_ms, _ = iterate(sizes.timed, sizes.repeats // 4, cpu, torch.device("cpu"))
+        found = [f"grows by {growth} bytes in {sizes.repeats} training steps"] if growth > 0 else []
+        say(check="memory", faults=found, seconds=time.perf_counter() - start)
         say(gpu_ms=gpu_ms, cpu_ms=cpu_ms)
     except Exception as error:
         line = (str(error).strip().splitlines() or [""])[0]
