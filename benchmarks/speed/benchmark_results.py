@@ -6,7 +6,6 @@ import os
 import platform
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import cleargs
@@ -16,6 +15,7 @@ from benchmarks.speed.peaks import Peaks
 from benchmarks.speed.roofline import Roof
 from benchmarks.speed.timing import Quartiles
 from benchmarks.speed.work import Size
+from cleargs.splat.pace import processor_name
 
 Times = dict[str, Quartiles]
 """Part of an iteration -> time in ms."""
@@ -103,16 +103,6 @@ def named(items: list[tuple[str, Any]]) -> dict[str, Any]:
     return {
         name: value._asdict() if isinstance(value, BenchmarkCase | Size) else value for name, value in items
     }
-
-
-def processor_name() -> str:
-    """Return the model name of the processor on Linux, or the architecture on other systems."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
 
 
 def describe_machine(load_before: float) -> Machine:

@@ -9,6 +9,7 @@ from typing import cast
 
 from cleargs.errors import InputError, did_you_mean
 from cleargs.pipeline.stage import Stage
+from cleargs.progress import Say
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,11 @@ class Dag:
     names: tuple[str, ...]
     load: Callable[[str], Stage]
     """Load a stage by name."""
+    pace: Callable[[Say | None], float] = lambda say: 1.0
+    """Return the time on this machine divided by the time on the machine that the estimates were made for.
+
+    With ``say``, the pace is measured unless it is known, which takes seconds, and ``say`` announces it.
+    """
     gpu_fault: Callable[[BaseException], str | None] = lambda error: None
     """Return in one line what failed on the GPU if that is the cause of an error, else None."""
 
@@ -38,7 +44,7 @@ class Dag:
 def installed() -> Dag:
     """Return the stages of the package ``cleargs.stages``. A module is imported when it is first used."""
     package = import_module("cleargs.stages")
-    return Dag(tuple(package.STAGES), load_stage, package.gpu_fault)
+    return Dag(tuple(package.STAGES), load_stage, package.pace, package.gpu_fault)
 
 
 def load_stage(name: str) -> Stage:

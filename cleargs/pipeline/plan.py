@@ -6,6 +6,7 @@ import resource
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +24,9 @@ from cleargs.safe_io import require_utf8
 
 MIN_ADDRESS_SPACE_GB = 2.0
 """Address space that the libraries reserve when they are imported."""
+
+WORTH_MEASURING_MIN = 2.0
+"""Expected work, in minutes, from which measuring the speed of this machine is worth its seconds."""
 
 NO_RESULTS = "no results yet"
 """Reason of a stage that never had results in this run."""
@@ -156,8 +160,32 @@ class Planner:
         changes = differences(before.parts, stage_key.parts, before.origins, stage_key.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
+    @cached_property
+    def pace(self) -> float:
+        """Factor of the estimates: time on this machine divided by that on the machine of the estimates."""
+        return self.dag.pace(None)
+
+    def at_measured_pace(self, plans: list[StagePlan]) -> list[StagePlan]:
+        """Return ``plans`` with the costs on this machine. Measures its pace unless it is known.
+
+        Short plans are returned as they are, because measuring takes seconds. So are those for a GPU, whose
+        pace is not measured.
+        """
+        costs = [plan.estimate.minutes for plan in plans if plan.estimate is not None]
+        if self.run.device != "cpu" or sum(costs) < WORTH_MEASURING_MIN:
+            return plans
+        before, self.pace = self.pace, self.dag.pace(self.reporter.info)
+        factor = self.pace / before
+        return [
+            plan if plan.estimate is None else replace(plan, estimate=plan.estimate.at_pace(factor))
+            for plan in plans
+        ]
+
     def estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
-        """Estimate the cost of ``name`` from its settings and finished upstream stages."""
+        """Estimate the cost of ``name`` on this machine from its settings and finished upstream stages."""
+        return self._estimate(name, done).at_pace(self.pace)
+
+    def _estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
         known = (name, *done)
         if known in self._estimates:
             return self._estimates[known]
@@ -167,7 +195,7 @@ class Planner:
             if upstream in done:
                 inputs[upstream] = self.store.folder(upstream, done[upstream].key)
             else:
-                expected[upstream] = self.estimate(upstream, done)
+                expected[upstream] = self._estimate(upstream, done)
         context = self.context(name, inputs, WorkFolder(self.store.root / "work" / "estimate"))
         self._estimates[known] = stage.estimate(replace(context, expected=expected))
         return self._estimates[known]

@@ -83,6 +83,7 @@ class Runner:
             if plan.state != "done":
                 self.dag.load(plan.stage).preflight(self.run.config.effective[plan.stage])
         check_disk(plans, self.store.root)
+        plans = self.planner.at_measured_pace(plans)
         for line in (*rerun_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
@@ -71,6 +71,10 @@ class Estimate:
     """Number of frames that the stage will publish; 0 if it publishes none."""
     megapixels: float = 0.0
     """Size of one of these frames."""
+
+    def at_pace(self, pace: float) -> Estimate:
+        """Return the estimate for a machine that takes ``pace`` times as long."""
+        return replace(self, minutes=pace * self.minutes)
 
 
 class Stage(Protocol):

@@ -13,7 +13,8 @@ from cleargs.splat.config import TrainConfig
 if TYPE_CHECKING:
     from cleargs.splat.views import TrainingView
 
-# Wall seconds on two idle cores of the reference machine (docs/speed.md): per step, constant and by size, ...
+# Wall seconds on two idle cores of the reference machine (`cleargs.splat.pace`): per step, constant and by
+# size, ...
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
 # ... and per megapixel for the estimate of a frame's image formation: the first one, where half of the frames
 # are assumed to be searched, and later ones.

@@ -20,7 +20,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import warp_layout
 from cleargs.splat.kernels.cuda.support import gpu_fault
-from cleargs.splat.random_scene import random_scene
+from cleargs.splat.pace import random_scene
 from cleargs.splat.types import Moments
 
 
