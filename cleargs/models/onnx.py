@@ -1,7 +1,7 @@
 """ONNX models on onnxruntime. CPU calls use one thread, so results do not depend on the thread count.
 
-`OnnxModel.map` is parallel over its items, for example image tiles: on the CPU several threads process one
-item each.
+`OnnxModel.map` is parallel over its items, for example image tiles. On the CPU several threads process one
+item each. On a GPU one call processes several items.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ from cleargs.safe_io import cause, read_bytes
 Device = Literal["cpu", "cuda"]
 
 CUDA_PROVIDER = "CUDAExecutionProvider"
+
+BATCH_PIXELS = 8 * 512 * 512
+"""Maximum number of pixels in a batch."""
 
 _MEMORY_ERRORS = ("bad_alloc", "allocate memory", "out of memory", "alloc_failed")
 """Texts of onnxruntime, CUDA and cuDNN for exhausted memory; onnxruntime has no exception class for it."""
@@ -134,6 +137,11 @@ class OnnxModel:
         """Shapes; None: free."""
         self.takes_floats = all(argument.type == "tensor(float)" for argument in self._inputs)
 
+    @property
+    def takes_batches(self) -> bool:
+        """True if `map` runs several items per call: on a GPU, if the first axis of all inputs is free."""
+        return self.device == "cuda" and all(shape[:1] == (None,) for shape in self.inputs)
+
     def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
         """Return all outputs for the given inputs, both in the model's order. The method is thread-safe.
 
@@ -158,13 +166,41 @@ class OnnxModel:
         items: Sequence[NDArray[np.float32]],
         threads: int,
     ) -> Iterator[Any]:
-        """Apply ``function`` to all items [H, W, C], and yield the results in their order.
+        """Apply ``function`` to all items [H, W, C] of one size, and yield the results in their order.
 
-        ``function`` maps [1, H, W, C] to results [1, ...] with one call of `run`. On the CPU ``threads``
-        items are processed at the same time, on a GPU one.
+        ``function`` maps a batch [N, H, W, C] to results [N, ...] with one call of `run`. On the CPU
+        ``threads`` items are processed at the same time, on a GPU as many as fit.
         """
+        if self.takes_batches:
+            yield from in_batches(function, items)
+            return
         with ThreadPoolExecutor(1 if self.device == "cuda" else threads) as pool:
             yield from pool.map(lambda item: function(item[None])[0], items)
+
+
+def in_batches(
+    function: Callable[[NDArray[np.float32]], NDArray[np.float32]], items: Sequence[NDArray[np.float32]]
+) -> list[Any]:
+    """Return the results of ``function`` for ``items`` [H, W, ...] of one size, computed in batches.
+
+    The batch size is halved if a batch does not fit into the GPU's memory. StageError is raised if one item
+    does not.
+    """
+    pixels = items[0].shape[0] * items[0].shape[1]
+    size = max(1, BATCH_PIXELS // pixels)
+    results: list[Any] = []
+    while len(results) < len(items):
+        batch = np.stack(items[len(results) : len(results) + size])
+        try:
+            results.extend(function(batch))
+        except MemoryError as error:
+            if len(batch) == 1:
+                raise StageError(
+                    f"the GPU's memory does not hold the data of a network for {pixels} pixels",
+                    hint="free memory on the GPU, or use --device cpu",
+                ) from error
+            size = len(batch) // 2
+    return results
 
 
 def _raise_exhausted(path: Path, error: Exception) -> None:

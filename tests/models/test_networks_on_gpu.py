@@ -1,14 +1,21 @@
-"""Device of networks in runs on a GPU, tested without a GPU."""
+"""Device of networks in runs on a GPU, and batches that fit its memory, tested without a GPU."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import onnxruntime
 import pytest
+from numpy.typing import NDArray
 
-from cleargs.models.onnx import CUDA_PROVIDER, OnnxModel, network_device
+from cleargs.errors import StageError
+from cleargs.models.expert import OnnxExpert
+from cleargs.models.onnx import CUDA_PROVIDER, OnnxModel, in_batches, network_device
 from cleargs.models.registry import model_file
+from cleargs.models.scorer import CLARITY, LearnedScorer
+
+Floats = NDArray[np.float32]
 
 
 @pytest.fixture
@@ -76,7 +83,72 @@ def test_a_provider_that_loads_is_used(
     (name, options), fallback = asked[0]
     assert (name, fallback) == (CUDA_PROVIDER, "CPUExecutionProvider")
     assert options["use_tf32"] == "0"
-    assert OnnxModel(model_file("embedded", "expert"), "cuda").device == "cuda"
+    assert OnnxModel(model_file("embedded", "expert"), "cuda").takes_batches
     asked.clear()
     OnnxModel(model_file("embedded", "expert"))
     assert asked == [["CPUExecutionProvider"]]
+
+
+def items(count: int) -> list[Floats]:
+    return [np.full((2, 3), number, np.float32) for number in range(count)]
+
+
+def test_batches_keep_the_order_and_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 25)
+    sizes = []
+
+    def run(batch: Floats) -> Floats:
+        sizes.append(len(batch))
+        return -batch
+
+    results = in_batches(run, items(10))
+    assert sizes == [4, 4, 2]
+    assert [result[0, 0] for result in results] == [-number for number in range(10)]
+    sizes.clear()
+    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 5)
+    in_batches(run, items(2))
+    assert sizes == [1, 1]
+
+
+def test_a_batch_that_does_not_fit_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 48)
+    tried = []
+
+    def run(batch: Floats) -> Floats:
+        tried.append(len(batch))
+        if len(batch) > 2:
+            raise MemoryError("Failed to allocate memory for requested buffer of size 8589934592")
+        return batch
+
+    results = in_batches(run, items(5))
+    assert tried == [5, 2, 2, 1]
+    assert [result[0, 0] for result in results] == list(range(5))
+
+
+def test_failures_of_single_items_are_errors() -> None:
+    def exhausted(batch: Floats) -> Floats:
+        raise MemoryError("CUDA error: out of memory")
+
+    def broken(batch: Floats) -> Floats:
+        raise RuntimeError("invalid input name")
+
+    with pytest.raises(StageError, match="does not hold") as caught:
+        in_batches(exhausted, items(3))
+    assert "--device cpu" in caught.value.hint
+    with pytest.raises(RuntimeError, match="invalid input"):
+        in_batches(broken, items(3))
+
+
+def test_batches_restore_and_score_as_single_tiles_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.random.default_rng(0).random((64, 300, 3), np.float32)
+    expert = OnnxExpert(model_file("embedded", "expert"))
+    path = model_file(CLARITY, "scorer")
+    assert path is not None
+    scorer = LearnedScorer(path, CLARITY, 64)
+    monkeypatch.setattr("cleargs.models.tiling.FREE_TILE", 128)
+    single, score = expert.restore(image), scorer.score(image)
+    monkeypatch.setattr(OnnxModel, "takes_batches", True)
+    together = expert.restore(image)
+    # The order of the sums in a convolution may differ in a batch.
+    np.testing.assert_allclose(together, single, atol=1e-5)
+    assert scorer.score(image) == pytest.approx(score, abs=1e-4)
