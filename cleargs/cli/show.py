@@ -12,6 +12,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
     FILE,
     answer,
@@ -138,7 +139,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
         rows.append([name, manifest.status, *cells, text])
     _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
     if None in manifests.values():
-        click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
+        click.echo(as_called(f"not done: see cleargs status {quote(str(run.folder))}"))
     if work := running_stage(run.folder, run.store):
         count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
         click.echo(f"\n{work.stage} is running: {', '.join(filter(None, (work.label, count, work.note)))}")
@@ -180,7 +181,7 @@ def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bo
         title = f"\n{name}: {tables[name].num_rows} rows"
         _print_table(fields, "column", "meaning", title=title, wraps="meaning")
     if not columns:
-        click.echo(f"\nall columns: cleargs show {quote(str(run))} {stage} --columns")
+        click.echo(as_called(f"\nall columns: cleargs show {quote(str(run))} {stage} --columns"))
 
 
 def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

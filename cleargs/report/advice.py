@@ -22,6 +22,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
+from cleargs.program import program
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
@@ -62,9 +63,7 @@ def shown_advice(
     if not any(advice.options and advice.worth for advice in found):
         found = [advice for advice in found if advice.worth]
     return [
-        advice._replace(
-            command=shlex.join([*_base(planner.run), *advice.options]), time=_time(planner, advice.options)
-        )
+        advice._replace(command=_command(planner.run, advice.options), time=_time(planner, advice.options))
         if advice.options
         else advice
         for advice in found
@@ -74,14 +73,16 @@ def shown_advice(
 def command(run: RunSpec, dag: Dag) -> str:
     """Return the ``cleargs run`` command that reproduces a run, to be called next to its folder."""
     recipe, changed = _nearest_recipe(run.config, dag)
-    words = [*_base(run), *(["--recipe", recipe] if recipe != "default" else [])]
+    words = ["--recipe", recipe] if recipe != "default" else []
     words += ["--seed", str(changed.pop("seed"))] if "seed" in changed else []
-    return shlex.join(words + _set(changed))
+    return _command(run, words + _set(changed))
 
 
-def _base(run: RunSpec) -> list[str]:
-    """Return the words of ``cleargs run`` for a capture and a run folder, called next to the run folder."""
-    return ["cleargs", "run", os.path.relpath(run.source, run.folder.parent), "-o", run.folder.name]
+def _command(run: RunSpec, options: Sequence[str]) -> str:
+    """Return ``cleargs run`` for a capture and a run folder, to be called next to the run folder."""
+    place = run.folder.parent
+    words = ["run", os.path.relpath(run.source, place), "-o", run.folder.name, *options]
+    return f"{program(place)} {shlex.join(words)}"
 
 
 def _nearest_recipe(config: Config, dag: Dag) -> tuple[str, dict[str, Any]]:

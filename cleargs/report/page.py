@@ -22,6 +22,7 @@ from cleargs.manifest import plain_json
 from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.plan import Planner, StagePlan
+from cleargs.program import program
 from cleargs.report.advice import command, shown_advice, toml_text
 from cleargs.report.formatting import duration
 from cleargs.report.frames import (
@@ -150,6 +151,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             settings=changed_settings(planner.run.config),
             versions=versions,
             command=command(planner.run, planner.dag),
+            program=program(run.parent),
             aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
             data={
                 "layers": LAYERS,
@@ -162,7 +164,9 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             },
         )
         write_report_json(folder, manifests, last)
-    leads_to_it = page_environment().get_template("entry.html.jinja").render(name=run.name)
+    leads_to_it = (
+        page_environment().get_template("entry.html.jinja").render(name=run.name, program=program(run.parent))
+    )
     write_bytes(run / ENTRY, leads_to_it.encode())
     return page_of(run)
 

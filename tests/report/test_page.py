@@ -173,6 +173,18 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
         assert write_run_report(planner, outcomes("found")) is None  # there is nothing to report on
 
 
+def test_commands_start_with_the_program_as_the_user_called_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = FinishedRun(tmp_path)
+    monkeypatch.setenv("CLEARGS_PROGRAM", f"{tmp_path}/.venv/bin/cleargs")
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+    commands = re.findall(r'data-copy="([^"]+)"', text)
+    assert len(commands) >= 4 and all(one.startswith(".venv/bin/cleargs r") for one in commands)
+    assert ".venv/bin/cleargs report run --single-file" in (run.folder / "report.html").read_text()
+
+
 def test_an_older_report_gets_a_note(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     assert outdated_report_note(run.folder, run.dag) == "", "there is none"
@@ -305,6 +317,9 @@ def test_the_command_writes_one_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert invoke(["report", str(run), "-q", "--single-file"]) == 0
     file = run / "run-report.html"
     assert f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)" in capsys.readouterr().out
+    (run / "report.html").unlink()
+    assert invoke(["report", str(run), "-q"]) == 0
+    assert capsys.readouterr().out == f"report: {(run / 'report.html').as_uri()}\n"
     assert (run / "report.html").is_file()
     assert invoke(["report", str(run), "--single-file", "--json", "-o", str(tmp_path / "a.html")]) == 0
     facts = json.loads(capsys.readouterr().out)
