@@ -728,8 +728,8 @@ def test_printed_commands_run_as_printed(tmp_path: Path) -> None:
     (home / "cleargs").write_text("")
     (tmp_path / "other").mkdir()
     code = (
-        "from cleargs.cli.commands import as_called; from cleargs.program import name_program; name_program(); "
-        "print(as_called('x cleargs run y'))"
+        "from cleargs.cli.commands import as_called; from cleargs.program import name_program\n"
+        "name_program(); print(as_called('x cleargs run y'))"
     )
     for path, folder, words in (
         ("/usr/bin", tmp_path, "x 'my env/bin/cleargs' run y"),
