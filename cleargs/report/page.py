@@ -27,10 +27,8 @@ from cleargs.report.advice import command, shown_advice, toml_text
 from cleargs.report.formatting import duration
 from cleargs.report.frames import (
     CHOICES,
-    LAYERS,
     MEANINGS,
     SCENES,
-    FramePictures,
     FrameRow,
     camera_of,
     faults_of,
@@ -38,9 +36,8 @@ from cleargs.report.frames import (
     scene_with_models,
     scores_of,
     worst_cue,
-    write_jpeg,
-    write_pictures,
 )
+from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
 from cleargs.report.report_json import (
     ENTRY,
     PAGE,
