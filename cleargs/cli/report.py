@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Sequence
 from contextlib import suppress
 from ipaddress import ip_address
@@ -92,7 +91,7 @@ def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path
     Returns:
         The page, or None if no frames exist or writing failed (with a warning).
     """
-    from cleargs.report.report_json import LastRun, is_current, linked_manifests, page_of
+    from cleargs.report.report_json import is_current, linked_manifests, page_of
 
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
@@ -102,10 +101,8 @@ def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path
         return page_of(run)
     from cleargs.report.page import write_report
 
-    usage = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    last = LastRun({outcome.stage: outcome.how for outcome in outcomes}, round(max(usage) * 1024 / 1e9, 2))
     try:
-        return write_report(planner, last)
+        return write_report(planner)
     except CleargsError as error:  # the run itself has succeeded
         planner.reporter.warn(f"no report was written: {error}; {error.hint}")
         return None

@@ -31,8 +31,6 @@ from cleargs.splat.config import steps_from_frames
 
 FEW_PLACED = 0.8
 """Share of frames with a pose, below which there is advice on them."""
-MANY_UNUSED = 0.4
-"""Share of placed frames with weight 0, above which there is advice on the thresholds."""
 BLURRED_PX = 6.0
 """Motion blur above which a frame counts as blurred, px."""
 SHORT = 0.8
@@ -136,7 +134,6 @@ class _Advisor:
     def __init__(self, planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> None:
         self._config, self._dag = planner.run.config, planner.dag
         self._manifests, self._rows = manifests, rows
-        self._placed = [row for row in rows if row.frame.registered]
 
     def _figure(self, stage: str, *path: str) -> Any:
         return figure_of(self._manifests, stage, *path)
@@ -195,20 +192,9 @@ class _Advisor:
 
     def _on_weights(self) -> Iterator[Advice]:
         """Yield advice on the weights of the frames."""
-        lower = {"rva.tau_R": round(max(self._setting("rva", "tau_R") - 0.1, 0.0), 2)}
-        if self._figure("rva", "stand_in"):
-            higher = {"rva.tau_B": round(min(self._setting("rva", "tau_B") + 0.1, 1.0), 2)}
-            what = "No frame counts as reliable, so the best ones are used"
-            why = "Thresholds closer to the scores of this capture separate good frames from bad ones."
-            yield Advice(what, why, NO_FIGURE, 0.3, tuple(_set(lower | higher)))
         if uncovered := self._figure("rva", "bins_uncovered_before"):
             what = f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame"
             yield Advice(what, "The scene may be softer there. Film more slowly there.", NO_FIGURE, 0.2)
-        weighted = sum(row.weight is not None for row in self._placed)
-        unused = sum(row.weight == 0.0 for row in self._placed)
-        if weighted and unused > MANY_UNUSED * weighted:
-            what, why = f"{unused} of {weighted} placed frames are not used", "A lower threshold uses more."
-            yield Advice(what, why, NO_FIGURE, 0.4, tuple(_set(lower)))
         blurred = sum((row.motion("blur_px") or 0.0) > BLURRED_PX for row in self._rows)
         if blurred > len(self._rows) / 2:
             what = f"{count(blurred, 'frame has', 'frames have')} more than {BLURRED_PX:g} px of motion blur"

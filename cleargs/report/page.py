@@ -41,9 +41,7 @@ from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pic
 from cleargs.report.report_json import (
     ENTRY,
     PAGE,
-    LastRun,
     cameras_of,
-    last_run,
     linked_manifests,
     page_of,
     write_report_json,
@@ -88,10 +86,8 @@ def page_environment() -> Environment:
     return environment
 
 
-def write_report(planner: Planner, last: LastRun | None = None) -> Path:
+def write_report(planner: Planner) -> Path:
     """Write the report of a run atomically, in place of an older one. Return the path of its page.
-
-    ``last`` is the work of the last ``cleargs run`` (default: as in the older report).
 
     Raises:
         InputError: if no stage of the run is finished.
@@ -101,7 +97,6 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
         raise InputError(f"no stage of {run} is finished", hint=f"see cleargs status {run}")
-    last = last or last_run(run)
     set_threads(planner.threads)
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
@@ -144,7 +139,6 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             manifests=manifests,
             cameras=cameras_of(manifests),
             plans=plans,
-            last=last,
             settings=changed_settings(planner.run.config),
             versions=versions,
             command=command(planner.run, planner.dag),
@@ -160,7 +154,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
                 "training": training_curves(run, trained),
             },
         )
-        write_report_json(folder, manifests, last)
+        write_report_json(folder, manifests)
     leads_to_it = (
         page_environment().get_template("entry.html.jinja").render(name=run.name, program=program(run.parent))
     )
