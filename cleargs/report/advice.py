@@ -147,7 +147,6 @@ class _Advisor:
             for missing in manifest.missing:
                 yield Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
         yield from self._on_frames()
-        yield from self._on_weights()
         if "g0" in self._manifests:
             yield from self._on_training()
 
@@ -189,12 +188,6 @@ class _Advisor:
                 0.0,
                 ("--set", "ingest.holdout=every:8"),
             )
-
-    def _on_weights(self) -> Iterator[Advice]:
-        """Yield advice on the weights of the frames."""
-        if uncovered := self._figure("rva", "bins_uncovered_before"):
-            what = f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame"
-            yield Advice(what, "The scene may be softer there. Film more slowly there.", NO_FIGURE, 0.2)
         blurred = sum((row.motion("blur_px") or 0.0) > BLURRED_PX for row in self._rows)
         if blurred > len(self._rows) / 2:
             what = f"{count(blurred, 'frame has', 'frames have')} more than {BLURRED_PX:g} px of motion blur"

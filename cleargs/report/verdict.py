@@ -26,9 +26,6 @@ HEADLINES: Mapping[Tone, str] = {
     "poor": "Poor: the scene matches the video only loosely.",
 }
 
-MEANING = "PSNR on pixels that no training used"
-"""Meaning of the figure in the headline."""
-
 
 class Verdict(NamedTuple):
     """The first lines of a report."""
@@ -37,8 +34,7 @@ class Verdict(NamedTuple):
     headline: str
     text: str
     figure: str
-    """PSNR in dB; "" if it is unknown."""
-    meaning: str
+    """PSNR in dB of pixels that no training used; "" if it is unknown."""
 
 
 def figure_of(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
@@ -57,9 +53,9 @@ def verdict(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen:
     if psnr is None:
         trained = "g0" in manifests
         headline = "The scene is trained." if trained else "The capture is prepared. No scene is trained yet."
-        return Verdict("fair", headline, text, "", "")
+        return Verdict("fair", headline, text, "")
     tone: Tone = "good" if psnr >= CLOSE_DB else "fair" if psnr >= LOOSE_DB else "poor"
-    return Verdict(tone, HEADLINES[tone], text, f"{psnr:.1f}", MEANING)
+    return Verdict(tone, HEADLINES[tone], text, f"{psnr:.1f}")
 
 
 def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> str:

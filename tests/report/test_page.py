@@ -183,6 +183,9 @@ def test_commands_start_with_the_program_as_the_user_called_it(
     commands = re.findall(r'data-copy="([^"]+)"', text)
     assert len(commands) >= 4 and all(one.startswith(".venv/bin/cleargs r") for one in commands)
     assert ".venv/bin/cleargs report run --single-file" in (run.folder / "report.html").read_text()
+    write_single_file(run.folder / "report/index.html", tmp_path / "one.html")
+    shared = re.findall(r'data-copy="([^"]+)"', (tmp_path / "one.html").read_text())
+    assert len(shared) == len(commands) and all(one.startswith("cleargs r") for one in shared)
 
 
 def test_an_older_report_gets_a_note(tmp_path: Path) -> None:
