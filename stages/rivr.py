@@ -333,7 +333,7 @@ def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: 
     from cleargs.rivr.distillation import publish
     from cleargs.rivr.tables import Selection, write_selection
 
-    context.reporter.info("RIVR: a draft makes no repairs; the scene is G0's, unchanged")
+    context.reporter.info("RIVR: no repairs in a draft: the scene of G0 stays as it is")
     rows = [Selection.not_tried(frame_id, "not tried: a draft") for frame_id in supervision.views]
     write_selection(context.out / "selection.parquet", rows)
     publish(g0, [], context.out, None)

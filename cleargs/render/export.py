@@ -62,7 +62,8 @@ def export_scene(
         raise InputError("--up and --world input exclude each other", hint="give one of them")
     thresholds, region = parse_prune(options.prune), parse_crop(options.crop)
     for output in outputs:
-        _require_free(output, options)
+        if output.exists() and not options.force:
+            raise InputError(f"{output} exists already", hint="choose another name, or give --force")
     ingest = run / "ingest"
     posed = [frame for frame in load_frames(ingest) if frame.registered]
     cameras = {frame.frame_id: (frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed}
@@ -105,11 +106,6 @@ def export_scene(
 
 def _stem(output: Path) -> str:
     return output.name[: -len(format_of(output)) - 1]
-
-
-def _require_free(output: Path, options: ExportOptions) -> None:
-    if output.exists() and not options.force:
-        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
 
 
 def _similarity(
