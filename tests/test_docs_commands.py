@@ -1,6 +1,6 @@
 """The commands in README and docs: all parse, and those of users run on a tiny video.
 
-Each command of a shell block runs in its order on the page, but for those in `NOT_RUN`, which has the reason.
+Each command of a shell block runs in its order on the page, except those in `NOT_RUN`, which has the reason.
 """
 
 from __future__ import annotations
@@ -53,7 +53,22 @@ NOT_RUN = {
 }
 """Part of a command on one of `USER_PAGES` -> reason why it does not run here."""
 OTHER_PROGRAMS = frozenset(
-    "apt-get brew cat cd docker export git pip pipx snakemake source sudo uv vllm wsl".split()
+    {
+        "brew",
+        "cat",
+        "cd",
+        "docker",
+        "export",
+        "git",
+        "pip",
+        "pipx",
+        "snakemake",
+        "source",
+        "sudo",
+        "uv",
+        "wsl",
+    }
+    | {"apt-get", "vllm"}
 )
 """Programs of others. Their commands are not checked."""
 
@@ -80,7 +95,7 @@ class Command:
 
 
 def commands(page: str) -> Iterator[Command]:
-    """Yield the commands in the shell blocks of a page, and those of ours in backquotes."""
+    """Yield the commands in the shell blocks of a page, and our commands in backquotes."""
     text = (ROOT / page).read_text(encoding="utf-8")
     for block in re.findall(r"(?ms)^ *```sh\n(.*?)^ *```", text):
         block = re.sub(r"(?ms)<<'(\w+)'\n.*?^\1$", "", block).replace("\\\n", " ")

@@ -132,8 +132,8 @@ def plot_gains(path: Path, rows: Sequence[FaultRow]) -> None:
     figure, panel = pyplot.subplots(figsize=(9.0, 0.3 * len(rows) + 1.0), layout="constrained")
     places = range(len(rows) - 1, -1, -1)  # the first row is at the top
     series = (
-        ("where it was filmed", [row.gain for row in rows], 0.12, "#3f51b5"),
-        ("from new viewpoints", [row.novel for row in rows], -0.12, "#e07a1f"),
+        ("at the filmed views", [row.gain for row in rows], 0.12, "#3f51b5"),
+        ("at new viewpoints", [row.novel for row in rows], -0.12, "#e07a1f"),
     )
     for label, gains, shift, colour in series:
         shown = [(place + shift, gain) for place, gain in zip(places, gains, strict=True) if gain]
