@@ -8,6 +8,7 @@ import click
 
 from cleargs.cli.common import DONE_IN_PART, output_option, quiet_option, work_options
 from cleargs.cli.progress_bars import make_reporter
+from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
@@ -102,6 +103,8 @@ def real(
     listed, out = read_real_list(), out.absolute()
     results = read_results(out / "real.json")
     pictured = ""
+    if rewrite and not results.scenes:
+        raise InputError(f"{out}/real.json has no results", hint="run the command without --rewrite first")
     if not rewrite:
         if captures is None:
             raise click.UsageError("--captures DIR is missing")

@@ -129,6 +129,8 @@ def test_pages_are_written_again_without_training(tmp_path: Path, capsys: pytest
     (tmp_path / "real.json").write_text(results().model_dump_json())
     assert invoke(["real", "-o", str(tmp_path), "--rewrite", "--page", str(page)]) == 3, "fox is missing"
     assert summary_table(read_real_list(), results()) in page.read_text()
+    assert invoke(["real", "-o", str(tmp_path / "empty"), "--rewrite", "--page", str(page)]) == 2
+    assert "has no results" in capsys.readouterr().err
     assert invoke(["real", "-o", str(tmp_path)]) == 2 and "--captures" in capsys.readouterr().err
 
 
