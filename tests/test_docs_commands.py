@@ -219,7 +219,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     clip = folder / "clip"
     make_capture(
-        clip, "sharp", frames=12, width=240, height=136, seed=3, reporter=SilentReporter(), video=True
+        clip, "sharp", frames=13, width=240, height=136, seed=3, reporter=SilentReporter(), video=True
     )
     (clip / "capture.mp4").rename(folder / "walk.mp4")
     return folder
@@ -246,7 +246,7 @@ def export_cameras() -> None:
 
 
 PREPARE: dict[str, Callable[[], None]] = {
-    "cleargs eval RUN --reference OUT/truth/observed": make_measured_run,
+    "--scene RUN/g0/scene.ply": make_measured_run,
     "--renders mine": make_renders,
     "--poses cameras.json": export_cameras,
     "cleargs diff walk walk-2": lambda: Path("walk-2").symlink_to("walk"),
@@ -254,6 +254,7 @@ PREPARE: dict[str, Callable[[], None]] = {
 """Part of a command -> what its page takes as given, made before it runs."""
 
 
+@pytest.mark.slow  # about a hundred seconds of one core: about fifty commands, with three small runs
 def test_commands_of_the_pages_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
     monkeypatch.setenv("CLEARGS_MODELS", str(place / "models"))
