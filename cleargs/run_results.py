@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,6 +58,14 @@ class Run:
     def stages(self) -> tuple[str, ...]:
         """Names of the finished stages, in order."""
         return tuple(name for name in installed().names if (self.folder / name).is_dir())
+
+    def _repr_html_(self) -> str:
+        """Return a table of the stages, for notebooks."""
+        rows = [("stage", "state", "seconds", "MB")]
+        for name, made in ((name, self[name].manifest) for name in self.stages):
+            rows.append((name, made.status, f"{made.seconds:.1f}", f"{made.bytes / 1e6:.1f}"))
+        body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+        return f"<p>{escape(str(self.folder))}</p><table>{body}</table>"
 
     def __getitem__(self, stage: str) -> StageResults:
         """Return the results of a stage. Raises InputError if it is not finished."""

@@ -164,6 +164,7 @@ def test_objects_are_short_in_a_notebook(place: Path) -> None:
     capture, scene = cg.open_prepared(run["ingest"]), run.scene()
     for found in (run, run["rva"], capture, scene, scene.gaussians):
         assert len(repr(found)) < 300 and "tensor(" not in repr(found)
+    assert run._repr_html_().count("<tr>") == 6
 
 
 def test_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

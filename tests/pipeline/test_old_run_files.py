@@ -34,7 +34,7 @@ def test_old_settings_are_the_recipe(tmp_path: Path) -> None:
 
 
 def test_old_run_takes_new_settings(tmp_path: Path) -> None:
-    """What it no longer has does not contradict the new settings, and is named."""
+    """A setting that is gone does not contradict the new settings, and is named."""
     (tmp_path / "capture").mkdir()
     (tmp_path / RUN_FILE).write_text(OLD)
     overrides, said = ["g0.quality=high", "g0.lr_means=1e-4"], list[str]()
