@@ -318,6 +318,8 @@ def _regions(evaluation: Evaluation) -> str:
     if evaluation.psnr_white is not None:
         between = _figure("psnr", evaluation.psnr_between)
         words.append(f"over white {evaluation.psnr_white:.2f} dB, {between} dB from black")
+    if evaluation.covered is not None:
+        words.append(f"{evaluation.covered:.1%} behind Gaussians in front of the true surface")
     return f"{_subject(evaluation)}: {'; '.join(words)}"
 
 
