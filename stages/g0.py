@@ -56,7 +56,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 30
+VERSION = 31
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -106,10 +106,9 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
-    from cleargs.formation.floaters import without_floaters
     from cleargs.formation.frames import real_views
     from cleargs.formation.movement import write_movement
-    from cleargs.formation.observed import Fit, evaluate_views, pooled_unseen
+    from cleargs.formation.observed import evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -162,13 +161,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
     learned = formation.exposure or Exposure.identity([view.frame_id for view in views])
     moving = formation.moving
-
-    def evaluate(scene: Scene) -> list[Fit]:
-        """Compare a scene with all views as they were filmed, except where something moves."""
-        return evaluate_views(scene, views, learned, formation.frames, moving=moving)
-
-    cameras, count = [view.camera for view in views], trained.scene.gaussians.num
-    trained, fits = without_floaters(trained, cameras, context.device, evaluate)
+    fits = evaluate_views(trained.scene.to(context.device), views, learned, formation.frames, moving=moving)
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
     write_exposure(context.out / "exposure.parquet", learned)
@@ -184,7 +177,6 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "views": len(views),
             "gaussians_start": gaussians.num,
             "gaussians": trained.scene.gaussians.num,
-            "floaters": count - trained.scene.gaussians.num,
             "steps": config.length,
             "sh_degree": gaussians.sh_degree,
             "exposure": exposure is not None,

@@ -304,6 +304,8 @@ def _regions(evaluation: Evaluation) -> str:
         words.append(f"over white {evaluation.psnr_white:.2f} dB, {between} dB from black")
     if evaluation.psnr_colour_aligned is not None:
         words.append(f"with aligned colours {evaluation.psnr_colour_aligned:.2f} dB")
+    if evaluation.covered is not None:
+        words.append(f"{evaluation.covered:.1%} behind Gaussians in front of the true surface")
     return f"{_subject(evaluation)}: {'; '.join(words)}"
 
 

@@ -110,6 +110,11 @@ class ImageResult(Figures):
     clipped: Region | None = Field(
         None, description="Pixels with a channel of the reference of at least 254."
     )
+    covered: float | None = Field(
+        None,
+        description="Share of the image that Gaussians in front of the true surface cover; null where the "
+        "reference has no depth.",
+    )
 
 
 class Evaluation(Figures):
@@ -130,6 +135,7 @@ class Evaluation(Figures):
     psnr_between: float | None = Field(None, description="Mean of `psnr_between` over the images.")
     far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
     clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
+    covered: float | None = Field(None, description="Mean of `covered` over the images.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
     weights: dict[str, str] = Field(description="Metric -> digest of the weights behind it.")
     trained_on: int | None = Field(
@@ -217,6 +223,7 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             ),
             column("psnr_white", pa.float64(), "dB, of the scene over white", nullable=True),
             column("psnr_between", pa.float64(), "dB, between background and white", nullable=True),
+            column("covered", pa.float64(), "share that Gaussians in mid-air cover", nullable=True),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
             column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),

@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from cleargs.capture.folders import image_files
@@ -32,6 +34,7 @@ from cleargs.evaluate.references import Reference, ReferenceView, matching
 from cleargs.evaluate.refinement import refine_pose
 from cleargs.files import disk_errors
 from cleargs.manifest import versions
+from cleargs.media.exr import read_depth
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
@@ -41,6 +44,9 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.types import ImageU8, MaskBool, PlaneF32
+
+IN_FRONT = 0.85
+"""Depth, over that of the true surface, below which the centre of a Gaussian is in front of it."""
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 
@@ -55,6 +61,8 @@ class _Prediction:
     refinement: Refinement | None = None
     far: MaskBool | None = None
     """Pixels in which a scene shows something behind the sparse points; None if these are not known."""
+    covered: float | None = None
+    """See `covered_share`; None if the true depth is not known."""
 
 
 Predict = Callable[[ReferenceView, ImageU8, MaskBool | None], _Prediction]
@@ -170,9 +178,42 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
         farthest = None if points is None else depth_of_points(points, camera)
         if farthest is not None:
             far = far_pixels(*depth_and_alpha(camera), farthest)
-        return _Prediction(*render(camera), refinement, far)
+        covered = None
+        if view.depth is not None:
+            surface = read_depth(view.depth)
+            if surface.shape != (camera.height, camera.width):
+                raise InputError(
+                    f"{view.depth} has {surface.shape[1]}x{surface.shape[0]} pixels, "
+                    f"its image {camera.width}x{camera.height}",
+                    hint="delete the depth, or write it at the size of the images",
+                )
+            covered = covered_share(scene, camera, surface / view.unit, mask)
+        return _Prediction(*render(camera), refinement, far, covered)
 
     return predict
+
+
+def covered_share(scene: Scene, camera: Camera, depth: PlaneF32, mask: MaskBool | None) -> float:
+    """Return the mean alpha, over the pixels that count, of the Gaussians in front of the true surface.
+
+    These are the Gaussians whose centre is nearer than `IN_FRONT` times the nearest surface around it.
+    ``depth`` [H, W] is the true one, in units of the scene; 0 where there is no surface.
+    """
+    means = scene.gaussians.means.numpy().astype(np.float64)
+    pose = camera.world_to_camera
+    x, y, z = np.einsum("ij,nj->in", pose[:3, :3], means) + pose[:3, 3:]
+    ahead = np.maximum(z, 1e-6)
+    column, row = np.floor(x / ahead * camera.fx + camera.cx), np.floor(y / ahead * camera.fy + camera.cy)
+    inside = (z > 0.0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    at = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
+    nearest = cv2.erode(depth, np.ones((5, 5), np.uint8))
+    front = torch.from_numpy(inside & (z < IN_FRONT * nearest[at]))
+    if not bool(front.any()):
+        return 0.0
+    fewer = replace(scene, gaussians=scene.gaussians.select(front))
+    alpha = rasteriser_for("cpu").view(fewer, camera).alpha.numpy().astype(np.float64)
+    counting = alpha if mask is None else alpha[mask]
+    return float(counting.mean()) if counting.size else 0.0
 
 
 def _evaluate(
@@ -219,6 +260,7 @@ def _evaluate(
             refinement=prediction.refinement,
             far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
             clipped=region(pixels, target, clipped_pixels(target), mask),
+            covered=prediction.covered,
         )
 
     images: list[ImageResult] = []
@@ -251,6 +293,7 @@ def _evaluate(
         psnr_between=mean_of(image.psnr_between for image in images),
         far=pooled(image.far for image in images),
         clipped=pooled(image.clipped for image in images),
+        covered=mean_of(image.covered for image in images),
         unavailable=dict(metrics.unavailable),
         weights=dict(metrics.weights),
         versions={

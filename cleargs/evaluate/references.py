@@ -60,6 +60,10 @@ class ReferenceView:
     """Pinhole of the image, in the scene's world."""
     load: Callable[[], tuple[ImageU8, MaskBool | None]]
     """Returns the image [H, W, 3] and its mask [H, W] (True counts; None: all do). Raises InputError."""
+    depth: Path | None = None
+    """EXR of the true depth, as `cleargs synth` writes it; None if it is not known."""
+    unit: float = 1.0
+    """Length in that file of a unit of the scene."""
 
     @property
     def pose(self) -> Pose:
@@ -131,7 +135,7 @@ def reference_of(
         hint = f"name the references like the frames (cleargs show {run} ingest)"
         alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
         if poses == "given":
-            views = [listed[stem].at(own[stem]) for stem in matching(listed, own, hint)]
+            views = [replace(listed[stem].at(own[stem]), depth=None) for stem in matching(listed, own, hint)]
             if missing := len(listed) - len(views):
                 reporter.warn(f"{missing} of {len(listed)} references match no frame: left out")
             alignment = Alignment(world="scene", matched=len(views))
@@ -147,7 +151,10 @@ def reference_of(
                 _report_fit(alignment, align or directory, reporter)
             else:
                 similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
-            views = [view.at(similarity.pose(view.pose)) for view in listed.values()]
+            views = [
+                replace(view.at(similarity.pose(view.pose)), unit=similarity.scale)
+                for view in listed.values()
+            ]
         found = _reference(directory.resolve().name, views, poses, alignment)
     try:
         return replace(found, points=load_points(ingest).xyz)
@@ -333,8 +340,11 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
         way = way_of(lens)
         flat = way.pinhole
         camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, np.eye(4))
-        view = ReferenceView(stem_of(entry.name), camera, partial(_load, entry, lens, way)).at(pose)
-        views.append((view.name, view))
+        stem = stem_of(entry.name)
+        depth = directory / "depth" / f"{stem}.exr"
+        known = depth if lens.is_pinhole and depth.is_file() else None
+        view = ReferenceView(stem, camera, partial(_load, entry, lens, way), known)
+        views.append((stem, view.at(pose)))
     return _by_stem(views)
 
 

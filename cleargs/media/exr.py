@@ -76,6 +76,24 @@ def write_depth(path: Path, depth: NDArray[Any]) -> None:  # [H, W]
     _write(path, np.asarray(depth[..., None], np.float32), {"Z": FLOAT}, {})
 
 
+def read_depth(path: Path) -> PlaneF32:
+    """Read the file of `write_depth`. Raises StoreError if it is missing, damaged, or has other channels."""
+    try:
+        open_regular(path).close()
+        source = ImageInput.open(str(path))
+        if source is None:
+            raise ValueError(geterror().strip())
+        spec = source.spec()
+        if spec.channelnames != ("Z",) or spec.width * spec.height > MAX_PIXELS:
+            raise ValueError(f"{spec.width}x{spec.height} pixels of {spec.channelnames}, not of Z alone")
+        pixels = source.read_image(FLOAT)
+        if pixels is None:
+            raise ValueError(source.geterror().strip())
+    except FAULTS as error:
+        raise StoreError(f"cannot read {path.name}: {cause(error)}", hint="delete the file") from error
+    return np.ascontiguousarray(pixels[..., 0])
+
+
 def _write(
     path: Path, pixels: NDArray[Any], channels: Mapping[str, Any], attributes: Mapping[str, Attribute]
 ) -> None:

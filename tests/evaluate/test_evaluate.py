@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import torch
 from eval_world import (
     FOCAL,
     HEIGHT,
@@ -38,8 +39,11 @@ from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.references import Reference, align_cameras, reference_of, umeyama
+from cleargs.media.exr import write_depth
 from cleargs.media.image import read_rgb, write_mask, write_rgb
+from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
+from cleargs.splat.scene import Scene
 
 SAME = Similarity(np.eye(3), np.zeros(3), 1.0)
 
@@ -376,6 +380,50 @@ def test_a_scene_is_measured_over_white_too(tmp_path: Path, opaque: bool) -> Non
         assert image.psnr_white is not None
         assert image.psnr_white > 55 if opaque else image.psnr_white == pytest.approx(between, abs=0.5)
     assert found.psnr_between is not None and (found.psnr_between > 45) == opaque
+
+
+def test_gaussians_in_front_of_the_true_surface_cover_a_share_of_the_view(tmp_path: Path) -> None:
+    """A wall 4 units away, and a haze that hides about half of its middle."""
+    side = 40
+    x, y = np.meshgrid(np.linspace(-6, 6, side), np.linspace(-5, 5, side))
+    wall = np.stack([x.ravel(), y.ravel(), np.full(side * side, 4.0)], axis=1)
+    haze = np.array([[0.0, 0.0, 2.0]])
+
+    def scene(*parts: NDArray[np.float64]) -> Scene:
+        means = np.concatenate(parts)
+        count = len(means)
+        radii = np.where(means[:, 2] > 3.0, 0.25, 0.3)
+        opacities = np.where(means[:, 2] > 3.0, 4.0, 0.0)
+        arrays = (
+            means,
+            np.log(radii)[:, None].repeat(3, axis=1),
+            np.tile([1.0, 0, 0, 0], (count, 1)),
+            opacities,
+            np.zeros((count, 1, 3)),
+        )
+        return Scene(Gaussians(*(torch.tensor(array, dtype=torch.float32) for array in arrays)))
+
+    views = [cameras()[0]]
+    folder = write_reference(tmp_path / "truth", scene(wall), views)
+    (folder / "depth").mkdir()
+    pose = views[0].world_to_camera
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(rows)], axis=-1)
+    depth = (4.0 - views[0].centre[2]) / (rays @ pose[:3, :3])[..., 2]  # in the run's world
+    write_depth(folder / "depth" / "000.exr", depth * WORLD.scale)
+    shares = []
+    for number, parts in enumerate(([wall], [wall, haze])):
+        run = write_run(tmp_path / f"run{number}", scene(*parts), cameras())
+        found = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
+        assert found.covered == found.images[0].covered
+        shares.append(found.covered)
+    # Gaussian of 0.3 / 1.7 * 90 = 16 px and opacity 1/2: 0.5 * 2 pi * 16^2 px of 96 x 72.
+    assert shares[0] == 0.0 and shares[1] == pytest.approx(0.115, abs=0.02)
+    given = reference_of(run, folder, poses="given", reporter=Remarks())
+    assert measured(run / "g0" / "scene.ply", given).covered is None  # another place, whose depth is unknown
+    write_depth(folder / "depth" / "000.exr", depth[1:])
+    with pytest.raises(InputError, match="96x71"):
+        measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
 
 
 def test_psnr_with_aligned_colours_is_there_too(tmp_path: Path) -> None:

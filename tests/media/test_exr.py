@@ -10,7 +10,15 @@ import pytest
 from OpenImageIO import HALF, ImageBuf, ImageInput
 
 from cleargs.errors import StoreError
-from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
+from cleargs.media.exr import (
+    LayeredImage,
+    from_layer,
+    read_depth,
+    read_exr,
+    to_layer,
+    write_depth,
+    write_exr,
+)
 
 NAMES = ("render", "restored", "fused", "observed")
 
@@ -115,6 +123,23 @@ def test_damaged_files_are_store_errors(tmp_path: Path, content: bytes | None) -
     path.write_bytes(content)
     with pytest.raises(StoreError):
         read_exr(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", "layers", "cut", None])
+def test_a_damaged_depth_is_a_store_error(tmp_path: Path, content: bytes | str | None) -> None:
+    path, depth = tmp_path / "depth.exr", np.linspace(1, 3, 64 * 48, dtype=np.float32).reshape(48, 64)
+    write_depth(path, depth)
+    np.testing.assert_array_equal(read_depth(path), depth)
+    if content == "layers":
+        write_exr(path, layered())
+    elif content == "cut":
+        path.write_bytes(path.read_bytes()[:1000])
+    elif content is None:
+        path.unlink()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(StoreError):
+        read_depth(path)
 
 
 def test_unwritable_place_is_a_store_error(tmp_path: Path) -> None:

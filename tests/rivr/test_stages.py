@@ -33,6 +33,7 @@ from tiny_capture import (
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
+from cleargs.formation.movement import write_movement
 from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.progress import SilentReporter
@@ -55,6 +56,8 @@ from cleargs.stages import consolidate, rivr
 
 HELD_BACK = 3
 """The middle one of the strong frames 0, 3 and 5."""
+MOVING_FRAME = 4
+"""In its left 20 columns something moves, in one test."""
 TARGETS = [k for k in range(len(ROLES)) if k != HELD_BACK]
 
 
@@ -334,10 +337,14 @@ def test_the_papers_rule_scores_no_raw_frame(capture: Capture) -> None:
     assert all(row.accepted for row in rows)
 
 
-def test_masked_pixels_do_not_reach_the_scores(
-    capture: Capture, monkeypatch: pytest.MonkeyPatch, expert: Sharpen
+@pytest.mark.parametrize("frame", [MASKED_FRAME, MOVING_FRAME])
+def test_masked_pixels_and_what_moves_do_not_reach_the_scores(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch, expert: Sharpen, frame: int
 ) -> None:
     """An expert that ruins the masked pixels changes no score; one that ruins the others does."""
+    cells = np.zeros((HEIGHT // 2, WIDTH // 2), np.bool_)
+    cells[:, :10] = True
+    write_movement(capture.root / "g0" / "movement.parquet", {MOVING_FRAME: cells})
 
     def scores(run: str, ruined: slice) -> Selection:
         def ruin(image: np.ndarray, **_: Any) -> np.ndarray:
@@ -349,7 +356,7 @@ def test_masked_pixels_do_not_reach_the_scores(
         context = capture.context("rivr", tiny_rivr(rounds=1, use_fused=False), run=run)
         rivr.run(context)
         rows = tried_rows(context)
-        return next(row for row in rows if row.frame_id == MASKED_FRAME)
+        return next(row for row in rows if row.frame_id == frame)
 
     untouched, masked, seen = scores("a", slice(0, 0)), scores("b", slice(0, 20)), scores("c", slice(20, 40))
     assert masked.primary_restored == untouched.primary_restored
