@@ -54,6 +54,9 @@ class SfmOutcome(FrozenModel):
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty: no camera was."""
 
+    torn_at: str = ""
+    """Working image at which the matches of SfM contradict its poses, as where scales differ; empty: none."""
+
     @property
     def refined(self) -> bool:
         """Return True if the poses are not those of the input."""
