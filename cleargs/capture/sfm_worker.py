@@ -53,7 +53,7 @@ _NEARER = 0.9
 """SfM is preferred to adjusted poses only if it lowers the mean error to at most this share: where both are
 right, they are alike, and adjusted poses are in the user's world exactly."""
 _JOINED, _JOINS = 0.95, 3
-"""Least share of the matches across a join whose features see one point, and most joins that are made again
+"""Least share of the matches across a join whose features see one point, and most joins that are repeated
 (docs/experiments/poses.md)."""
 _FITS_PX, _FITS = 2.0, 0.5
 """Poses fit the images where at least this share of the matches is within this many pixels of its epipolar
@@ -288,7 +288,7 @@ class _Sfm:
         return self._rejoined(model, self._matched), placed
 
     def _rejoined(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
-        """Return ``model`` after joins that contradict the matches across them were made again.
+        """Return ``model`` after the joins that contradict the matches across them were repeated.
 
         The first pair of mapping may get a wrong focal length and depth, with which the first frames fit each
         other; the next ones then go on at another scale. The smaller side of such a join is placed again from
@@ -301,6 +301,8 @@ class _Sfm:
             numbers = [found.image_id - 1 for found in model.images.values() if found.has_pose]
             sides = [{i for i in numbers if (i < image - 1) == before} for before in (True, False)]
             for side in sorted(sides, key=len):
+                if len(numbers) - len(side) < 3:
+                    continue
                 found = self._continued(model, database, side, _FIRST)
                 again, better = weakest_join(found, database)
                 if better > share and _names_in(found) >= _names_in(model):
