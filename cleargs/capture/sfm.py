@@ -81,7 +81,11 @@ def reconstruct(
     if not posed:
         model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
-        _warn_if_torn(outcome, frames, reporter)
+        if outcome.torn_at is not None:
+            reporter.warn(
+                f"the frames before {frames[outcome.torn_at].source.name} may be at another scale: "
+                "use more frames (ingest.max_frames), or leave one part out"
+            )
         return _normalised(model, None, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
     worlds = _conventions(list(poses.values()), others=given is None)
@@ -111,7 +115,6 @@ def reconstruct(
     found = dict(outcome.placed) or dict.fromkeys(poses, "adjusted" if outcome.refined else "given")
     outcome = outcome.model_copy(update={"placed": _placed(frames, found)})
     if outcome.method == "sfm":
-        _warn_if_torn(outcome, frames, reporter)
         return _normalised(model, worlds[outcome.convention][0], outcome)
     if adopted is not None and len(adopted.error) and not outcome.refined:
         model = adopted
@@ -175,16 +178,6 @@ def _check_registered(registered: int, total: int, config: SfmConfig, reporter: 
         raise StageError(f"only {registered} of {total} frames could be placed in space", hint=_ADVICE)
     if registered < WARN_REGISTERED * total:
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
-
-
-def _warn_if_torn(outcome: SfmOutcome, frames: Sequence[WorkFrame], reporter: Reporter) -> None:
-    """Name the frame at which the poses of SfM contradict the matches."""
-    for frame in frames:
-        if frame.image == outcome.torn_at:
-            reporter.warn(
-                f"the frames before {frame.source.name} may be at another scale than the others, as many "
-                "matches contradict the poses: use more frames (ingest.max_frames), or leave one part out"
-            )
 
 
 def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:

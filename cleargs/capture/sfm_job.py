@@ -53,9 +53,8 @@ class SfmOutcome(FrozenModel):
     """Method -> median distance from their epipolar lines of matches that were kept out, px."""
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty: no camera was."""
-
-    torn_at: str = ""
-    """Working image at which the matches of SfM contradict its poses, as where scales differ; empty: none."""
+    torn_at: int | None = None
+    """Number of the first frame after a join that contradicts its matches."""
 
     @property
     def refined(self) -> bool:

@@ -52,7 +52,7 @@ the truth than given ones, unless these are far off. All three, and the next, by
 _NEARER = 0.9
 """SfM is preferred to adjusted poses only if it lowers the mean error to at most this share: where both are
 right, they are alike, and adjusted poses are in the user's world exactly."""
-_JOINED, _JOINS = 0.95, 3
+_JOINED, _JOINS = 0.93, 3
 """Least share of the matches across a join whose features see one point, and most joins that are repeated
 (docs/experiments/poses.md)."""
 _FITS_PX, _FITS = 2.0, 0.5
@@ -111,7 +111,7 @@ class _Sfm:
         self._database = job.folder / "database.db"
         self._matched = self._database
         """The database with the features by which frames were placed."""
-        self._torn_at = ""
+        self._torn_at: int | None = None
         self._output = job.folder / "model.partial"
         self._options = pycolmap.IncrementalPipelineOptions(
             num_threads=1, random_seed=job.seed, extract_colors=False
@@ -184,9 +184,7 @@ class _Sfm:
         if not 0 < errors[best] <= share * errors["given"]:
             return start, outcome.model_copy(update={"errors_px": errors})
         model = self._with_points(models[best], self._matched if best == "sfm" else self._database)
-        update = {"method": best, "lens": lens_of(model)}
-        if best == "sfm":
-            update |= {"placed": placed, "torn_at": self._torn_at}
+        update = {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
         return model, outcome.model_copy(update={"errors_px": errors, **update})
 
     def _convention(self, given: Mapping[str, list[list[list[float]]]]) -> str:
@@ -310,7 +308,7 @@ class _Sfm:
                     break
             else:
                 break
-        self._torn_at = self._job.names[image - 1] if share < _JOINED else ""
+        self._torn_at = image - 1 if share < _JOINED else None
         return model
 
     def _map(self) -> pycolmap.Reconstruction:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from cleargs.capture import sfm, sfm_worker
@@ -15,12 +14,13 @@ from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import CaptureConfig, SfmConfig
 from cleargs.capture.database import create_database
 from cleargs.capture.judging import weakest_join
+from cleargs.capture.model import SparseModel
 from cleargs.capture.prepare import prepare
-from cleargs.capture.sfm_job import SfmOutcome
+from cleargs.capture.sfm_job import Job, SfmOutcome
 from cleargs.capture.sources import open_capture
-from cleargs.progress import SilentReporter
+from cleargs.progress import Reporter, SilentReporter
 
-from .conftest import RecordingReporter
+from .conftest import Ingest
 
 Poses = dict[int, NDArray[np.float64]]
 
@@ -64,14 +64,19 @@ def test_a_part_at_another_scale_is_placed_again(images: Path, tmp_path: Path) -
     ]
     size = np.ptp([image.projection_center() for image in right.images.values()], axis=0).max()
     # The torn one is off by half its extent. Two adjustments of the same matches differ by a few per mille.
-    assert len(off) == 10 and max(off) < 0.02 * size and not placer._torn_at
+    assert len(off) == 10 and max(off) < 0.02 * size and placer._torn_at is None
 
 
-def test_a_join_that_stays_wrong_is_named() -> None:
-    frames = [
-        SimpleNamespace(image=f"{i}.png", source=SimpleNamespace(name=f"IMG_{i}.jpg")) for i in range(3)
-    ]
-    reporter = RecordingReporter()
-    for torn_at in ("", "2.png"):
-        sfm._warn_if_torn(SfmOutcome(torn_at=torn_at), cast(Any, frames), reporter)
-    assert len(reporter.warnings) == 1 and "before IMG_2.jpg" in reporter.warnings[0]
+def test_a_join_that_stays_wrong_is_named(
+    images: Path, ingest: Ingest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = sfm._run
+
+    def torn(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
+        model, outcome = run(job, reporter)
+        return model, outcome.model_copy(update={"torn_at": 3})
+
+    assert not any("another scale" in text for text in ingest(images).warnings)
+    monkeypatch.setattr(sfm, "_run", torn)
+    name = sorted(path.name for path in images.iterdir())[3]
+    assert any(f"before {name} may be at another scale" in text for text in ingest(images, "torn").warnings)
