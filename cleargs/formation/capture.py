@@ -3,11 +3,11 @@
 The first look at a frame searches it, except in a draft. The next looks follow after every
 `FormationConfig.every` steps on it. They refine its motion with the scene of that time. A test of a few
 milliseconds (`pretest`) says if blur is left that nothing explains, and only then the frame is searched
-again. The sharper the scene becomes, the more blur the test finds. At every fourth look a path of a higher
-order is tried.
+again. The sharper the scene becomes, the more blur the test finds. At the fourth look after the first one, at
+the eighth, and whenever their number has doubled, a path of a higher order is tried.
 
 Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
-is searched at the first look of a training and at every fourth one, since the test cannot see a skew.
+is searched at the first look of a training and at these looks, since the test cannot see a skew.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ skewed frames. At a place that few frames see, it hides a skew before `Formation
 (docs/experiments/formation.md)."""
 DOUBTED = 0.5
 """Weight by RVA below which a frame is doubted."""
-SEARCH_EVERY = 4
-"""Looks at a frame from one try of a higher order to the next, and where the shutter rolls from one search to
-the next."""
+AGAIN = 4
+"""Looks at a frame from the first one to the next try of a higher order, and where the shutter rolls to the
+next search. After that their number doubles from one to the next: the scene changes less and less."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
@@ -172,7 +172,7 @@ class CaptureFormation:
                 pose=frame_id in self._posed,
                 doubted=self._weights[frame_id] < DOUBTED,
                 rolling=self._rolls(),
-                again=(frame.draws // self._config.every) % SEARCH_EVERY == 0,
+                again=_searched_again(frame.draws // self._config.every),
                 test_rolling=frame_id in self._tested and frame.skew_gain is None,
                 draft=self._draft,
             )
@@ -253,6 +253,12 @@ class CaptureFormation:
 
     def _rolls(self) -> bool:
         return rolls(self._frames.values())
+
+
+def _searched_again(looks: int) -> bool:
+    """Return True for 0, `AGAIN` and its doubles: 0, 4, 8, 16, 32, ..."""
+    rounds, rest = divmod(looks, AGAIN)
+    return rest == 0 and rounds & (rounds - 1) == 0
 
 
 def _tested_frames(count: int) -> list[int]:

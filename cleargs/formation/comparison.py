@@ -148,9 +148,9 @@ class Level:
         return flow_basis(widened(self._pair.camera, self._pair.margin), self.nearness)
 
     @cached_property
-    def _stack(self) -> ArrayF32:
+    def _planes(self) -> ArrayF32:
         slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
-        return np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
+        return np.ascontiguousarray(np.stack([self._image, *slopes]), np.float32)
 
     @cached_property
     def _nowhere(self) -> ArrayF32:
@@ -205,7 +205,7 @@ class Level:
         curved = bool((active >= BEND.start).any()) or motion.order > 1
         offset, sweep, _, curve = self.fields(motion, curved)
         return cpu.normal_equations(
-            self._stack,
+            self._planes,
             self._observed,
             self._fitting,
             self._basis,

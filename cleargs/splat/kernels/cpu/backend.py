@@ -282,7 +282,7 @@ def misfit(
 
 
 def normal_equations(
-    stack: ArrayF32,  # [H, W, 3]
+    planes: ArrayF32,  # [3, H, W]
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
     basis: ArrayF32,  # [6, 2, H, W]
@@ -299,7 +299,7 @@ def normal_equations(
     matrices, sides = np.empty((height, count, count)), np.empty((height, count))
     with LAUNCHING:
         frame_search.normal_equations(
-            stack,
+            planes,
             observed,
             weight,
             basis,
@@ -313,8 +313,7 @@ def normal_equations(
             matrices,
             sides,
         )
-    lower = matrices.sum(axis=0)
-    return lower + np.tril(lower, -1).T, sides.sum(axis=0)
+    return matrices.sum(axis=0), sides.sum(axis=0)
 
 
 def blur_sums(
@@ -386,7 +385,7 @@ def _warm_up_formation() -> None:
         offset, sweep, radius, curve = _arrays(fields)
         misfit(pixels, pixels, pixels, (offset, sweep, radius, curve), np.zeros((1, 3), np.float32), 1.0)
         normal_equations(
-            np.zeros((SIZE, SIZE, 3), np.float32),
+            np.zeros((3, SIZE, SIZE), np.float32),
             pixels,
             pixels,
             np.zeros((6, 2, SIZE, SIZE), np.float32),

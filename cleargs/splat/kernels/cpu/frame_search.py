@@ -5,14 +5,24 @@ Images have one channel and no margin; ``frame_warp`` has the formula of the fie
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import prange
 
 from cleargs.splat.kernels.cpu.frame_warp import aside, between, bow, ess
-from cleargs.splat.kernels.cpu.jit import kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.types import AnyArray, ArrayF32
 
 _ONE = np.float32(1)
+
+
+@inlined
+def _mixed(plane: Any, i: Any, j: Any, a: Any, b: Any) -> Any:
+    """Return the value of ``plane`` [H, W] between four pixels, the first of which is (i, j)."""
+    above = plane[j, i] + a * (plane[j, i + 1] - plane[j, i])
+    below = plane[j + 1, i] + a * (plane[j + 1, i + 1] - plane[j + 1, i])
+    return above + b * (below - above)
 
 
 @kernel
@@ -60,9 +70,7 @@ def misfits(
                     at_y += aside(samples[k, 0], bent[1, n], bent[3, n])
                 i, a = between(at_x, right)
                 j, b = between(at_y, bottom)
-                above = image[j, i] + a * (image[j, i + 1] - image[j, i])
-                below = image[j + 1, i] + a * (image[j + 1, i + 1] - image[j + 1, i])
-                exposed[n] += above + b * (below - above)
+                exposed[n] += _mixed(image, i, j, a, b)
         total, count = 0.0, 0
         for x in range(width):
             if weight[y, x] != 0.0:
@@ -73,7 +81,7 @@ def misfits(
 
 @kernel
 def normal_equations(
-    stack: ArrayF32,  # [H, W, 3]: image, its derivatives by x and y
+    planes: ArrayF32,  # [3, H, W]: image, its derivatives by x and y
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
     basis: ArrayF32,  # [6, 2, H, W]: image motion per component of a twist, px
@@ -84,7 +92,7 @@ def normal_equations(
     times: ArrayF32,  # [K]
     outlier: float,
     active: AnyArray,  # [A] int64: unknowns, of the 30 numbers of pose, blur, skew, bend and cube
-    matrices: AnyArray,  # [H, A, A] float64, written (lower triangles)
+    matrices: AnyArray,  # [H, A, A] float64, written
     sides: AnyArray,  # [H, A] float64, written
 ) -> None:
     """Write each row's share of the Gauss-Newton equations for the twists of a frame's motion.
@@ -94,48 +102,67 @@ def normal_equations(
     """
     height, width = observed.shape
     right, bottom = np.float32(width - 1), np.float32(height - 1)
-    share = 1.0 / times.size
-    twist = basis.shape[0]
+    share = np.float32(1.0 / times.size)
+    twist, unknowns = basis.shape[0], len(active)
     for y in prange(height):
-        matrices[y] = 0.0
-        sides[y] = 0.0
-        jacobian = np.empty((3 if curve is None else 5) * twist)
-        means = np.empty(5 if curve is None else 9, np.float32)
+        # Pixels that count are packed without gaps, so that the inner loops can be vectorised.
+        columns = np.empty(width, np.int64)
+        place, along = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
+        bent = np.empty((4, 0 if curve is None else width), np.float32)
+        count = 0
         for x in range(width):
-            if weight[y, x] == 0.0:
-                continue
-            means[:] = 0.0
-            for t in times:
-                at_x = np.float32(x) + offset[0, y, x] + t * sweep[0, y, x]
-                at_y = np.float32(y) + offset[1, y, x] + t * sweep[1, y, x]
+            if weight[y, x] != 0.0:
+                columns[count] = x
+                place[0, count] = np.float32(x) + offset[0, y, x]
+                place[1, count] = np.float32(y) + offset[1, y, x]
+                along[0, count], along[1, count] = sweep[0, y, x], sweep[1, y, x]
                 if curve is not None:
-                    at_x += aside(t, curve[0, y, x], curve[2, y, x])
-                    at_y += aside(t, curve[1, y, x], curve[3, y, x])
+                    for part in range(4):
+                        bent[part, count] = curve[part, y, x]
+                count += 1
+        # The image, and its derivatives times each polynomial of time.
+        sums = np.zeros((5 if curve is None else 9, count), np.float32)
+        for t in times:
+            second, third = bow(t), ess(t)
+            for p in range(count):
+                at_x = place[0, p] + t * along[0, p]
+                at_y = place[1, p] + t * along[1, p]
+                if curve is not None:
+                    at_x += second * bent[0, p] + third * bent[2, p]
+                    at_y += second * bent[1, p] + third * bent[3, p]
                 i, a = between(at_x, right)
                 j, b = between(at_y, bottom)
-                for c in range(3):
-                    above = stack[j, i, c] + a * (stack[j, i + 1, c] - stack[j, i, c])
-                    below = stack[j + 1, i, c] + a * (stack[j + 1, i + 1, c] - stack[j + 1, i, c])
-                    value = above + b * (below - above)
-                    means[c] += value
-                    if c > 0:
-                        means[c + 2] += t * value
-                        if curve is not None:
-                            means[c + 4] += bow(t) * value
-                            means[c + 6] += ess(t) * value
+                sums[0, p] += _mixed(planes[0], i, j, a, b)
+                slope_x, slope_y = _mixed(planes[1], i, j, a, b), _mixed(planes[2], i, j, a, b)
+                sums[1, p] += slope_x
+                sums[2, p] += slope_y
+                sums[3, p] += t * slope_x
+                sums[4, p] += t * slope_y
+                if curve is not None:
+                    sums[5, p] += second * slope_x
+                    sums[6, p] += second * slope_y
+                    sums[7, p] += third * slope_x
+                    sums[8, p] += third * slope_y
+        jacobian, asked = np.empty((3 if curve is None else 5) * twist), np.empty(unknowns)
+        matrix, side = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+        for p in range(count):
+            x = columns[p]
             for n in range(twist):
                 u, v = share * basis[n, 0, y, x], share * basis[n, 1, y, x]
-                moved = u * means[1] + v * means[2]
+                moved = u * sums[1, p] + v * sums[2, p]
                 jacobian[n] = moved
-                jacobian[twist + n] = u * means[3] + v * means[4]
+                jacobian[twist + n] = u * sums[3, p] + v * sums[4, p]
                 jacobian[2 * twist + n] = down[y] * moved
                 if curve is not None:
-                    jacobian[3 * twist + n] = u * means[5] + v * means[6]
-                    jacobian[4 * twist + n] = u * means[7] + v * means[8]
-            left = observed[y, x] - share * means[0]
+                    jacobian[3 * twist + n] = u * sums[5, p] + v * sums[6, p]
+                    jacobian[4 * twist + n] = u * sums[7, p] + v * sums[8, p]
+            left = observed[y, x] - share * sums[0, p]
             factor = weight[y, x] / max(1.0, abs(left) / outlier)
-            for n in range(len(active)):
-                scaled = factor * jacobian[active[n]]
-                sides[y, n] += scaled * left
-                for m in range(n + 1):
-                    matrices[y, n, m] += scaled * jacobian[active[m]]
+            for n in range(unknowns):
+                asked[n] = jacobian[active[n]]
+            for n in range(unknowns):
+                scaled = factor * asked[n]
+                side[n] += scaled * left
+                for m in range(unknowns):  # the whole row, which is faster than its part up to n
+                    matrix[n, m] += scaled * asked[m]
+        matrices[y], sides[y] = matrix, side
