@@ -52,7 +52,7 @@ the truth than given ones, unless these are far off. All three, and the next, by
 _NEARER = 0.9
 """SfM is preferred to adjusted poses only if it lowers the mean error to at most this share: where both are
 right, they are alike, and adjusted poses are in the user's world exactly."""
-_JOINED, _JOINS = 0.93, 3
+_JOINED, _JOINS = 0.92, 3
 """Least share of the matches across a join whose features see one point, and most joins that are repeated
 (docs/experiments/poses.md)."""
 _FITS_PX, _FITS = 2.0, 0.5
