@@ -132,8 +132,7 @@ def weakest_join(model: pycolmap.Reconstruction, database: Path) -> tuple[int, f
             counts[one + 1 : two + 1] += seen.sum()
             holding[one + 1 : two + 1] += (seen & (first == second)).sum()
     share = np.divide(holding, counts, out=np.ones_like(counts), where=counts > 0)
-    image = int(share.argmin())
-    return image, float(share[image])
+    return int(share.argmin()), float(share.min())
 
 
 def _distances(first: Any, second: Any, matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -55,8 +55,3 @@ class SfmOutcome(FrozenModel):
     """COLMAP model of the cameras that were adjusted; empty: no camera was."""
     torn_at: int | None = None
     """Number of the first frame after a join that contradicts its matches."""
-
-    @property
-    def refined(self) -> bool:
-        """Return True if the poses are not those of the input."""
-        return self.method != "given"

@@ -290,24 +290,19 @@ class _Sfm:
 
         The first pair of mapping may get a wrong focal length and depth, with which the first frames fit each
         other; the next ones then go on at another scale. The smaller side of such a join is placed again from
-        the larger one, or else the larger from the smaller.
+        the larger one.
         """
         image, share = weakest_join(model, database)
         for _ in range(_JOINS):
             if share >= _JOINED:
                 break
-            numbers = [found.image_id - 1 for found in model.images.values() if found.has_pose]
-            sides = [{i for i in numbers if (i < image - 1) == before} for before in (True, False)]
-            for side in sorted(sides, key=len):
-                if len(numbers) - len(side) < 3:
-                    continue
-                found = self._continued(model, database, side, _FIRST)
-                again, better = weakest_join(found, database)
-                if better > share and _names_in(found) >= _names_in(model):
-                    model, image, share = found, again, better
-                    break
-            else:
+            numbers = {found.image_id - 1 for found in model.images.values() if found.has_pose}
+            before = {i for i in numbers if i < image - 1}
+            found = self._continued(model, database, min(before, numbers - before, key=len), _FIRST)
+            again, better = weakest_join(found, database)
+            if better <= share or not _names_in(found) >= _names_in(model):
                 break
+            model, image, share = found, again, better
         self._torn_at = image - 1 if share < _JOINED else None
         return model
 
