@@ -42,7 +42,7 @@ class ConsolidateConfig(Settings):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 29
+VERSION = 30
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {

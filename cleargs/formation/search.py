@@ -46,6 +46,10 @@ MAX_ORDER = 3
 ORDER_PENALTY = 0.005
 """Share of the misfit without any motion that each further order of the path must explain to be preferred."""
 
+BEND_SHARE = 0.01
+"""Share of the difference that a path must explain at a size before a cubic one is tried there. Most frames
+are sharp, and a cubic path has four times the unknowns of a straight one."""
+
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
 
@@ -81,12 +85,14 @@ def search(
         straight = curved = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
             straight = _best(level, [straight, still], model, steps, pose)
-            if BLUR in _ACTIVE[model] and level is not levels[-1]:
-                start = min(straight, curved, key=level.cost)
+            if level is levels[-1] or BLUR not in _ACTIVE[model]:
+                continue
+            start = min(straight, curved, key=level.cost)
+            if _explains(level, start, still):
                 curved = _best(level, [start], model, steps, pose, MAX_ORDER)
         found.append((model, straight))
         if straight.blur.any() or curved.blur.any():
-            paths = _curved(levels[-1], straight, curved, model, LEVELS[len(levels) - 1][1], pose)
+            paths = _curved(levels[-1], [straight, curved, still], model, LEVELS[len(levels) - 1][1], pose)
             found += [(model, path) for path in paths]
     if defocus:
         disc = _sharpest_disc(coarse, still)
@@ -134,6 +140,11 @@ def preferred(found: list[MotionFit]) -> MotionFit:
     return min(found, key=cost)
 
 
+def _explains(level: Level, motion: FrameMotion, still: FrameMotion) -> bool:
+    """Return True if ``motion`` explains enough at this size for a cubic path to be tried."""
+    return level.cost(motion) < (1.0 - BEND_SHARE) * level.cost(still)
+
+
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
     vector = np.zeros_like(motion.vector)
     for part in (POSE, *_ACTIVE[model]):
@@ -162,11 +173,17 @@ def _best(
 
 
 def _curved(
-    level: Level, straight: FrameMotion, curved: FrameMotion, model: Model, steps: int, pose: bool
+    level: Level, paths: list[FrameMotion], model: Model, steps: int, pose: bool
 ) -> list[FrameMotion]:
-    """Return the quadratic and the cubic path at the finest level, from those of the levels before."""
+    """Return the quadratic path at the finest level, and the cubic one where it may explain more.
+
+    ``paths`` are the straight one, that of the levels before, and none.
+    """
+    straight, curved, still = paths
     quadratic = _best(level, [straight], model, steps, pose, 2)
     start = min(quadratic, curved, key=level.cost)
+    if not _explains(level, start, still):
+        return [quadratic]
     return [quadratic, _best(level, [start], model, steps, pose, MAX_ORDER)]
 
 

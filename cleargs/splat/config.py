@@ -114,7 +114,7 @@ class TrainConfig(Settings):
     end: float = Field(1.0, gt=0, le=1, description="end of this training in the schedule, as a fraction")
     background: tuple[Unit, Unit, Unit] | None = Field(
         None,
-        description="sRGB behind the scene; unset = black, and in training a random colour at each step, so "
+        description="sRGB behind the scene; unset = black, and in training a random grey at each step, so "
         "that what was filmed becomes opaque",
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")

@@ -35,14 +35,15 @@ def rate_factor(steps: int) -> float:
     return min(MAX_RATE_FACTOR, max(1.0, math.sqrt(INRIA_STEPS / steps)))
 
 
-def random_colour(seed: Sequence[int], step: int) -> Colour:
+def random_grey(seed: Sequence[int], step: int) -> Colour:
     """Return the colour behind the scene in a step, if the settings name none.
 
-    Only an opaque pixel has the colour of its photograph over all colours, so what was filmed becomes opaque.
-    With one colour, such as black, dark parts of the scene stay transparent.
+    Only an opaque pixel has the colour of its photograph over every grey, so what was filmed becomes opaque.
+    Over black alone, dark parts of the scene stay transparent. Random colours instead of greys make the
+    gradients noisier and the scenes a little softer (docs/experiments/training.md).
     """
-    red, green, blue = np.random.default_rng([*seed, Stream.BACKGROUND, step]).random(3).tolist()
-    return red, green, blue
+    grey = float(np.random.default_rng([*seed, Stream.BACKGROUND, step]).random())
+    return grey, grey, grey
 
 
 class Schedule:

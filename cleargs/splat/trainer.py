@@ -33,7 +33,7 @@ from cleargs.splat.interruption import deferred_sigterm
 from cleargs.splat.kernels.cpu.jit import compiled_mark
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.scene import Colour, Scene
-from cleargs.splat.schedule import Schedule, random_colour
+from cleargs.splat.schedule import Schedule, random_grey
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import PREVIEW_SIDE, TrainLog, write_preview
 from cleargs.splat.types import Moments, Render, group
@@ -212,7 +212,7 @@ class Trainer:
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
         depth = formed is not None and formed.needs_depth
-        colour = random_colour(self._seed, schedule_step) if config.background is None else None
+        colour = random_grey(self._seed, schedule_step) if config.background is None else None
         render = self._render(camera, depth=depth, background=colour)
         image = render.image if formed is None else formed.forward(render)
         mask = mask if formed is None else formed.mask
