@@ -13,6 +13,7 @@ from cleargs.progress import SilentReporter
 from cleargs.synth.synthetic_capture import make_capture
 
 
+@pytest.mark.slow  # 12 s of a processor
 def test_wrong_cameras_come_nearer_to_the_true_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_capture(
         tmp_path / "room", "sharp", frames=12, width=240, height=180, seed=1, reporter=SilentReporter()
