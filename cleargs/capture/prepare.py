@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.overlay import still_parts, wraps_around
 from cleargs.errors import InputError
-from cleargs.files import make_folder
+from cleargs.files import make_folder, remove
 from cleargs.media.image import (
     image_size,
     is_panorama,
@@ -65,7 +64,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     paths = [images / f"{index:06d}.png" for index in range(len(capture.frames))]
     pairs = list(zip(capture.frames, paths, strict=True))
     with reporter.task("reading frames", len(paths)) as task:
-        todo = {path: frame for frame, path in pairs if not _is_intact(path)}
+        todo = {path: frame for frame, path in pairs if not _is_intact(path, reporter)}
         task.update(done=len(paths) - len(todo))
         for path, rgb in _pictures(todo):
             write_rgb(path, reduced(rgb, long_side))
@@ -98,10 +97,14 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     return prepared
 
 
-def _is_intact(image: Path) -> bool:
-    """Return True if a killed run left ``image``, and it can be read."""
-    with suppress(InputError):
-        return len(read_rgb(image)) > 0
+def _is_intact(image: Path, reporter: Reporter) -> bool:
+    """Return True if a killed run left ``image`` intact. A damaged file is removed with a warning."""
+    if image.is_symlink() or image.exists():
+        try:
+            return len(read_rgb(image)) > 0
+        except InputError:
+            reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is written again")
+            remove(image)
     return False
 
 

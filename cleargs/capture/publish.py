@@ -40,12 +40,10 @@ def publish(
     The published model is returned. ``model`` is that of the working images in ``work``, ``placed`` says how
     the pose of each was found or why there is none, and ``test`` are the numbers of the test frames.
     """
-    make_folder(out / "images")
+    make_folder(out / "images", empty=True)
     remove(out / "masks")  # without the folder, no frame has a mask
     if any(frame.masked for frame in frames):
         make_folder(out / "masks")
-    for file in {*(out / "images").iterdir()} - {out / "images" / frame.image for frame in frames}:
-        remove(file)
     flat: list[Intrinsics] = []
     numbers: dict[Intrinsics, int] = {}
     images: dict[int, ModelImage] = {}
