@@ -114,8 +114,7 @@ def weakest_join(model: pycolmap.Reconstruction, database: Path) -> tuple[int, f
     """Return the image whose join with the images before it holds least, and the share of matches that hold.
 
     A verified match between it or a later image and an earlier one holds if both features see the same point.
-    If the parts have different scales, their features see two points. Only matches of features that
-    see points count. The share is 1 without any.
+    With different scales they see two. Only features that see points count; without any, the share is 1.
     """
     points = {
         key: np.array([point.point3D_id for point in image.points2D], np.uint64)
