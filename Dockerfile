@@ -1,8 +1,11 @@
 # docker build -t cleargs . && docker run --rm -v "$PWD:/work" cleargs run walk.mp4
+# The commands are those of docs/install.md, "Your own environment".
 FROM python:3.12-slim
-ARG TORCH_INDEX=
+ARG PIP_EXTRA_INDEX_URL=
+ENV PIP_NO_CACHE_DIR=1
 COPY . /tmp/cleargs
-RUN pip install --no-cache-dir --extra-index-url "$TORCH_INDEX" -c /tmp/cleargs/constraints.txt '/tmp/cleargs[heif]' \
-    && rm -rf /tmp/cleargs
+WORKDIR /tmp/cleargs
+RUN pip install -c constraints.txt '.[heif]'
 WORKDIR /work
+RUN cleargs doctor
 ENTRYPOINT ["cleargs"]

@@ -80,6 +80,7 @@ lint: .venv/dev.stamp
 	$(BIN)/codespell
 	$(BIN)/mypy cleargs stages benchmarks tools
 	$(BIN)/python -m tools.prose
+	$(BIN)/python -m tools.prose README.md CHANGELOG.md CONTRIBUTING.md docs
 
 convert-env: .venv-convert/stamp
 

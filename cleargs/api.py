@@ -42,7 +42,6 @@ def run(
     threads: int | None = None,
     store: str | Path | None = None,
     progress: Progress = None,
-    workflow: str | None = None,
 ) -> Run:
     """Turn a capture into a clean scene in the run folder ``folder``, as ``cleargs run`` does.
 
@@ -62,7 +61,6 @@ def run(
         threads: Number of threads (default: all usable cores).
         store: Folder for results (default: that of the run, or ``.store`` in ``folder``).
         progress: Receiver of progress and remarks.
-        workflow: Former name of ``recipe``.
 
     Raises:
         InputError: if the capture or a setting cannot be used.
@@ -80,7 +78,7 @@ def run(
         dag,
         Path(source),
         default_folder(Path(source)) if folder is None else Path(folder),
-        recipe=recipe or workflow,
+        recipe=recipe,
         overrides=[
             *([f"g0.quality={quality}"] if quality else []),
             # Settings are parsed as TOML, which reads these JSON values too.

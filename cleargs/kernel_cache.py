@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from contextlib import suppress
@@ -23,6 +24,16 @@ def cache_folder(name: str) -> Path:
             with tempfile.TemporaryFile(dir=folder):
                 return folder
     return Path(tempfile.mkdtemp(prefix=f"cleargs-{name}-"))
+
+
+def installation() -> str:
+    """Return a digest of the places and times of the kernels' sources.
+
+    Numba compiles again where one of them differs, such as in another environment with the same program.
+    """
+    sources = sorted(Path(__file__).parent.glob("splat/kernels/cpu/*.py"))
+    stamps = repr([(str(source), source.stat().st_mtime_ns) for source in sources])
+    return hashlib.sha256(stamps.encode()).hexdigest()[:8]
 
 
 def configure_numba(name: str) -> None:

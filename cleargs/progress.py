@@ -136,6 +136,8 @@ class LineReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         last = begin = time.monotonic()
+        if total is None:  # no line may come until the end
+            self._progress(f"{label}: started")
 
         def show(done: int, note: str, left: float | None) -> None:
             nonlocal last

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from cleargs.base_model import Inherited, Settings
+from cleargs.base_model import Settings
 from cleargs.pipeline.stage import Device
 from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig, steps_from_frames
@@ -31,12 +31,6 @@ REPAIR_LIBRARIES = (
     "safetensors",
 )
 
-_GROWTH = (
-    *("coarse_share", "coarse_factor", "budget", "max_budget", "growth", "refine_every", "refine_start"),
-    *("refine_stop", "min_opacity", "noise", "strategy", "adaptive", "sh_every"),
-)
-"""Settings of the earlier trainings that had no effect on the later ones."""
-
 
 def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     """Return the versions of the other libraries that compute on ``device`` in rivr and consolidate."""
@@ -48,13 +42,6 @@ def other_libraries(device: Device, config: object) -> Mapping[str, str]:
 
 class DistilConfig(Settings):
     """Joint distillation of raw frames and repairs. Settings that are missing here are those of [g0]."""
-
-    RETIRED: ClassVar[Mapping[str, Any]] = {
-        **{name: Inherited("g0") for name in (*TrainConfig.model_fields, *TrainConfig.__class_vars__)},
-        **{name: Inherited("g0", strictly=False) for name in _GROWTH},
-        "opacity_reg": 0.0,
-        "scale_reg": 0.0,
-    }
 
     steps: int | None = Field(
         None,

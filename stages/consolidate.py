@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from cleargs.base_model import Inherited, Settings
+from cleargs.base_model import Settings
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 
@@ -32,8 +32,6 @@ class FinalDistilConfig(DistilConfig):
 class ConsolidateConfig(Settings):
     """Full-Trajectory Repair Consolidation. The limits for its scene are in [rivr.harm]."""
 
-    RETIRED: ClassVar[Mapping[str, Any]] = {"harm": Inherited("rivr")}
-
     scorer: str = Field(
         "clarity-net",
         description="measures harm, whose limits are in [rivr.harm]: the name of a scorer, or an ONNX file",
@@ -51,7 +49,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "g0": TRAINED,
     "rivr": (*TRAINED, "selection.parquet", *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1))),
 }
-OUTPUTS = (*TRAINED, "train.parquet", "repairs.parquet", "before_after.png")
+OUTPUTS = (*TRAINED, "train.parquet", "repairs.parquet")
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = REPAIR_LIBRARIES
 
@@ -100,7 +98,6 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.rivr.distillation import TrainedScene, publish
     from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.rounds import pseudo_view
-    from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
     from cleargs.rivr.tables import (
         chosen_counts,
         kept_raw,
@@ -156,15 +153,6 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         )
     publish(final, trainings, context.out, rejected)
 
-    frames = [row.frame_id for row in repairs] or list(supervision.views)
-    write_before_after_sheet(
-        context.out / "before_after.png",
-        supervision.worst(frames, SHEET_FRAMES),
-        g0,
-        final,
-        {row.frame_id: row for row in repairs},
-        rivr,
-    )
     better = "consolidated scene" if verdict.harm is None else "RIVR's scene"
     return StageResult(
         summary={
@@ -182,13 +170,10 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
 def _unchanged(context: StageContext[ConsolidateConfig], supervision: Supervision) -> StageResult:
     """Publish G0's scene as it is, which is all that a draft does."""
     from cleargs.rivr.distillation import TrainedScene, publish
-    from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
     from cleargs.rivr.tables import write_repairs
 
     context.reporter.info("consolidation: a draft trains no further; the scene is G0's, unchanged")
     g0 = TrainedScene(context.inputs["g0"], context.device)
     write_repairs(context.out / "repairs.parquet", [])
     publish(g0, [], context.out, None)
-    worst = supervision.worst(list(supervision.views), SHEET_FRAMES)
-    write_before_after_sheet(context.out / "before_after.png", worst, g0, g0, {}, context.inputs["rivr"])
     return StageResult(summary={"repairs": 0, "published": "G0", "draft": True})

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
-from cleargs.splat.config import INIT_OPACITY, INIT_SCALE, TrainConfig
+from cleargs.splat.config import TrainConfig
 
 from .config import G0_END, TRAINED
 
@@ -23,12 +23,6 @@ if TYPE_CHECKING:
 
 class G0Config(TrainConfig):
     """The first scene, from the sparse points and the frames that RVA keeps."""
-
-    RETIRED: ClassVar[Mapping[str, Any]] = {
-        **TrainConfig.RETIRED,
-        "init_scale": INIT_SCALE,
-        "init_opacity": INIT_OPACITY,
-    }
 
     end: float = Field(
         G0_END,

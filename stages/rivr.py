@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from cleargs.base_model import Settings
-from cleargs.errors import StoreError
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.gates import GateConfig
@@ -44,10 +42,10 @@ class RivrConfig(Settings):
     """Render-Guided In-Video Restoration."""
 
     rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="rounds in which every target frame is repaired")
-    targets: Literal["auto", "all", "degraded"] = Field(
+    targets: Literal["auto", "all"] = Field(
         "auto",
-        description="frames to repair: all registered training frames, or those that are not strong; auto = "
-        "those that image formation and RVA leave in need, and the next ones up to a sixteenth of the frames",
+        description="frames to repair: all registered training frames; auto = those that image formation and "
+        "RVA leave in need, and the next ones up to a sixteenth of the frames",
     )
     expert: str = Field(
         "embedded",
@@ -125,7 +123,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "rva": ("frames.parquet",),
     "g0": TRAINED,
 }
-OUTPUTS = (*TRAINED, "train.parquet", "selection.parquet", "candidates.png")
+OUTPUTS = (*TRAINED, "train.parquet", "selection.parquet")
 LEFTOVERS = ("round_*/*.exr",)
 LIBRARIES = REPAIR_LIBRARIES
 
@@ -170,7 +168,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     frames, megapixels = capture_size(context)
     if g0.quality == "draft":
         return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
-    targets = _expected_targets(context, frames)
+    targets = frames if config.targets == "all" else max(2, round(AUTO_SHARE * frames))
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
@@ -187,19 +185,6 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     )
 
 
-def _expected_targets(context: StageContext[RivrConfig], frames: int) -> int:
-    """Return how many frames are likely repaired; before RVA has run half of them count as degraded."""
-    if context.config.targets != "degraded":
-        return frames if context.config.targets == "all" else max(2, round(AUTO_SHARE * frames))
-    from cleargs.parquet import read_table
-    from cleargs.rva.tables import FRAMES
-
-    with suppress(KeyError, StoreError):
-        roles = read_table(context.inputs["rva"] / "frames.parquet", FRAMES).column("role").to_pylist()
-        return sum(role != "strong" for role in roles)
-    return frames // 2
-
-
 def run(context: StageContext[RivrConfig]) -> StageResult:
     """Make, score, choose and distil candidates, group by group and round by round; check for harm."""
     from cleargs.models.expert import load_expert
@@ -209,7 +194,6 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.need import frames_to_repair, rows_of_others
     from cleargs.rivr.rounds import Rules, forget_others
-    from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
     from cleargs.splat.backend import set_threads
@@ -247,7 +231,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     if 2 * (refused := refused_repairs(rows)) > made:
         reporter.warn(
             f"{refused} of {made} repairs by {expert.name} were refused: they agree with neither the "
-            "raw frame nor the render (candidates.png shows some); the renders replace them"
+            "raw frame nor the render (the report shows them); the renders replace them"
         )
 
     before = g0.fidelity(supervision.holdout_views, rules.primary, threads)
@@ -257,10 +241,6 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")
     final, rejected = (current, None) if verdict.harm is None else (g0, current)
     publish(final, trainings, context.out, rejected)
-    worst = supervision.worst([view.frame_id for view in targets], SHEET_FRAMES)
-    last = {row.frame_id: row for row in rows}
-    shown = [last[view.frame_id] for view in worst]
-    write_candidates_sheet(context.out / "candidates.png", shown, context.out)
     return StageResult(
         summary={
             "expert": expert.name,
@@ -351,12 +331,10 @@ def _repair_and_distil(
 def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: TrainedScene) -> StageResult:
     """Publish G0's scene as it is, which is all that a draft does."""
     from cleargs.rivr.distillation import publish
-    from cleargs.rivr.sheets import write_candidates_sheet
     from cleargs.rivr.tables import Selection, write_selection
 
-    context.reporter.info("RIVR: a draft makes no repairs; the scene is G0's, unchanged")
+    context.reporter.info("RIVR: no repairs in a draft: the scene of G0 stays as it is")
     rows = [Selection.not_tried(frame_id, "not tried: a draft") for frame_id in supervision.views]
     write_selection(context.out / "selection.parquet", rows)
     publish(g0, [], context.out, None)
-    write_candidates_sheet(context.out / "candidates.png", [], context.out)
     return StageResult(summary={"rounds": [], "published": "G0", "draft": True})

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
-from cleargs.plugins import installed_version
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rva.config import AssessmentConfig, EvaluatorConfig
 
 
@@ -29,24 +28,15 @@ _REPLIES_PER_MINUTE = 20  # from a vision-language model, per connection: a gues
 
 
 def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
-    """Return the folder of the vision-language model, if it runs in this process."""
-    if config.evaluator == "qwen3-vl" and config.qwen.model_dir:
-        return {"vlm": Path(config.qwen.model_dir).expanduser().absolute()}
+    """Return no file: all inputs are in the store."""
     return {}
-
-
-def other_libraries(device: Device, config: RvaConfig) -> Mapping[str, str]:
-    """Return the libraries of a vision-language model, if it runs in this process."""
-    local = externals(config, Path())
-    return {name: installed_version(name) for name in ("torch", "transformers") if local}
 
 
 def preflight(config: RvaConfig) -> None:
     """Check the evaluator.
 
     Raises:
-        InputError: if the server does not answer or does not have the model, or if the model in the folder
-            cannot be loaded.
+        InputError: if the server does not answer or does not have the model.
     """
     from cleargs.rva.evaluators import check_evaluator
 
@@ -54,7 +44,7 @@ def preflight(config: RvaConfig) -> None:
 
 
 def estimate(context: StageContext[RvaConfig]) -> Estimate:
-    """Estimate the cost: time for the cues, and memory for a few images per thread and for the model."""
+    """Estimate the cost: time for the cues, and memory for a few images per thread."""
     from .cost import capture_size
 
     config = context.config
@@ -62,11 +52,8 @@ def estimate(context: StageContext[RvaConfig]) -> Estimate:
     if config.evaluator != "qwen3-vl":
         seconds = _SECONDS_PER_MEGAPIXEL * megapixels * frames / context.threads
         return Estimate(minutes=seconds / 60, memory_gb=0.3, disk_gb=0.001)
-    at_once = 1 if config.qwen.model_dir else config.qwen.concurrency
-    folders = externals(config, context.source).values()
-    weights = sum(file.stat().st_size for folder in folders for file in folder.glob("*"))
-    minutes = frames / (_REPLIES_PER_MINUTE * at_once)
-    return Estimate(minutes=minutes, memory_gb=0.3 + weights / 1e9, disk_gb=0.001)
+    minutes = frames / (_REPLIES_PER_MINUTE * config.qwen.concurrency)
+    return Estimate(minutes=minutes, memory_gb=0.3, disk_gb=0.001)
 
 
 def run(context: StageContext[RvaConfig]) -> StageResult:

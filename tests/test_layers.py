@@ -24,6 +24,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cleargs.stages", "cleargs.workflows"),
     ("cleargs.batch",),
     ("cleargs.cli",),
+    ("cleargs.__main__",),
 )
 """Packages from the bottom up. A module belongs to the longest name that it starts with."""
 

@@ -66,6 +66,14 @@ def test_the_versions_here_are_those_of_the_lock() -> None:
     assert len(here) > 40 and here == {name: locked[name] for name in here}
 
 
+def test_the_container_has_the_steps_of_the_page() -> None:
+    """The commands of the Dockerfile are those of docs/install.md."""
+    page = (ROOT / "docs" / "install.md").read_text().partition("## Your own environment")[2]
+    commands = re.search(r"```sh\n(.*?)```", page, re.DOTALL)
+    steps = re.findall(r"^RUN (.+)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert commands is not None and len(steps) >= 2 and steps == commands[1].splitlines()
+
+
 LEFT_OPEN = ("pip", "torch", "nvidia-", "cuda-", "triton")
 """Packages that the lock leaves out: pip, torch (see constraints.txt) and its dependencies."""
 

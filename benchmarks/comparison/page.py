@@ -35,8 +35,8 @@ from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
 from cleargs.files import whole_folder
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
-from cleargs.report.frames import ImageFile, side_of, write_jpeg
 from cleargs.report.page import page_environment, write_page
+from cleargs.report.pictures import ImageFile, side_of, write_jpeg
 from cleargs.report.report_json import page_of
 
 MAX_POSES = 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ from pydantic import Field, ValidationError
 
 from benchmarks.comparison.cells import Cell, Cells, Spread
 from benchmarks.comparison.findings import Comparison, compare_scenes
+from benchmarks.comparison.front_page import has_block, with_block, without_digest
 from benchmarks.comparison.pictures import find_image
 from benchmarks.comparison.scenes import Sample, SceneRecipe, evaluate_views, make_scenes
 from benchmarks.comparison.tables import Table
@@ -20,11 +20,12 @@ from benchmarks.images import read_rgb_float
 from cleargs.base_model import FrozenModel
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError, ConfigError, InputError
+from cleargs.evaluate.eval_report import Figures
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
-from cleargs.safe_io import FAULTS, cause, read_text
+from cleargs.safe_io import FAULTS, cause, read_bytes, read_text
 
 SHOWCASE = "blurball"
 """Scene of the picture: its licence (CC BY 4.0) allows to show it."""
@@ -34,13 +35,17 @@ REFINE_STEPS = 15
 """Steps of fitting each test pose for the second PSNR."""
 REFINED = "psnr_refined"
 
-_BLOCK = re.compile(r"(<!-- real -->\n).*?(<!-- /real -->)", re.DOTALL)
+SHORT, FULL = "real", "real-full"
+"""Names of the places for the two tables in a page."""
+_LABELS = {variant.name: variant.label for variant in VARIANTS} | {"all-view": "all frames alike"}
 
 
 class RealScene(FrozenModel):
     """A capture with its protocol."""
 
     name: str
+    shows: str
+    """Content and quality of the capture, for readers."""
     capture: str
     """Place in the folder of the captures."""
     settings: tuple[str, ...]
@@ -145,35 +150,135 @@ def run_scenes(
     return found
 
 
-def real_table(listed: RealList, found: Comparison) -> str:
-    """Return the table of the results and the published figures, with its conditions, as Markdown."""
-    cells, labels = found.results.cells, {variant.name: variant.label for variant in VARIANTS}
+class StoredScene(Figures):
+    """Results of one scene."""
+
+    version: str
+    """Version of the source that made them."""
+    seeds: int
+    cells: tuple[Cell, ...]
+
+
+class RealResults(Figures):
+    """``OUT/real.json``: results of all scenes, which may be of several calls."""
+
+    scenes: dict[str, StoredScene] = Field(default_factory=dict)
+    failures: tuple[str, ...] = ()
+    """Reasons for what the last call could not make."""
+
+    def with_scenes(self, found: Comparison, version: str, seeds: int) -> RealResults:
+        """Return the results of ``found``, and those of other scenes that an earlier call has stored."""
+        columns = dict.fromkeys(cell.column for cell in found.cells)
+        made = {
+            name: StoredScene(
+                version=version, seeds=seeds, cells=tuple(cell for cell in found.cells if cell.column == name)
+            )
+            for name in columns
+        }
+        return RealResults(scenes=self.scenes | made, failures=tuple(found.failures))
+
+    @property
+    def cells(self) -> Cells:
+        return Cells(cell for scene in self.scenes.values() for cell in scene.cells)
+
+
+def read_results(path: Path) -> RealResults:
+    """Read ``real.json``; without the file, or from a file of another form, nothing is read."""
+    try:
+        return RealResults.model_validate_json(read_bytes(path))
+    except (OSError, ValidationError):
+        return RealResults()
+
+
+def real_table(listed: RealList, found: RealResults) -> str:
+    """Return all results and the published figures, with their conditions, as Markdown."""
+    cells = found.cells
     head = ["", "", "PSNR", "PSNR, test poses refined", "SSIM", "LPIPS (AlexNet)", "processor minutes"]
     rows, notes = [], []
     for scene in listed.scenes:
-        shown = [variant for variant in cells.variants() if cells.of("held-out", scene.name, variant)]
-        for variant in shown:
-            rows.append([scene.name, labels[variant], *_figures(cells, scene.name, variant)])
-        if shown:
-            own = cells.of("held-out", scene.name, shown[0])
-            notes.append(f"* {scene.name}: {scene.protocol}; {own[0].images} views, {own[0].steps:,} steps.")
-        rows += [_published(one) for one in listed.published if one.scene == scene.name and shown]
+        stored = found.scenes.get(scene.name)
+        if stored is None:
+            continue
+        for variant in dict.fromkeys(cell.variant for cell in stored.cells):
+            rows.append([scene.name, _LABELS[variant], *_figures(cells, scene.name, variant)])
+        first = stored.cells[0]
+        notes.append(
+            f"* {scene.name}: {scene.protocol}; {first.images} views, {first.steps:,} steps; "
+            f"{_trainings(stored)}; version {stored.version}."
+        )
+        rows += [_published(one) for one in listed.published if one.scene == scene.name]
     names = {scene.name for scene in listed.scenes}
     rows += [_published(one) for one in listed.published if one.scene not in names]
     notes += [
         f"* {one.method}: {one.source}; {one.protocol}."
         for one in listed.published
-        if one.scene not in names or cells.columns("held-out").count(one.scene)
+        if one.scene not in names or one.scene in found.scenes
     ]
-    seeds = (
-        len({cell.sample for cell in cells.cells if cell.column == cells.cells[0].column})
-        if cells.cells
-        else 0
-    )
-    mean = f"Means of {seeds} trainings, ± sample standard deviation." if seeds > 1 else "One training each."
-    line = f"{mean} Published results are in italics; those marked * were read at second hand."
+    line = "Published results are in italics; those marked * were read at second hand."
     missing = [f"* Not made: {failure}." for failure in found.failures]
-    return "\n\n".join([Table(head, rows).markdown(), line, "\n".join([*notes, *missing])])
+    return "\n\n".join([Table(head, rows).markdown(), line, "\n".join([*notes, *missing]), _COMMAND])
+
+
+def summary_table(listed: RealList, found: RealResults) -> str:
+    """Return one row per scene, with the published figures of these scenes, as Markdown."""
+    head = ["real capture", "all frames alike", "ClearGS", "processor minutes"]
+    rows, versions, absent = [], [], []
+    for scene in listed.scenes:
+        stored = found.scenes.get(scene.name)
+        if stored is None:
+            absent.append(scene.name)
+            continue
+        before, after = (found.cells.of("held-out", scene.name, name) for name in ("all-view", "full"))
+        rows.append(
+            [
+                f"{scene.name}: {scene.shows}",
+                _short(found.cells, scene.name, "all-view"),
+                _short(found.cells, scene.name, "full"),
+                f"{_minutes(before)} and {_minutes(after)}",
+            ]
+        )
+        for one in listed.published:
+            if one.scene == scene.name:
+                lpips = "-" if one.lpips is None else f"{one.lpips:.3f}"
+                rows.append([f"*{one.method}, on {one.scene}*", "", f"*{one.psnr:.2f} / {lpips}*", ""])
+        versions.append(f"{scene.name} {without_digest(stored.version)} ({_trainings(stored)})")
+    line = (
+        "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians; in brackets PSNR "
+        f"with refined test poses. Version {'; '.join(versions)}."
+    )
+    if absent:
+        line += f" Still to be measured: {', '.join(absent)}."
+    return f"{Table(head, rows).markdown()}\n\n{line}"
+
+
+def with_tables(page: str, listed: RealList, found: RealResults) -> str:
+    """Return ``page`` with the tables in their places `SHORT` and `FULL`.
+
+    Raises:
+        InputError: if the page has neither place.
+    """
+    if not has_block(page, FULL):
+        return with_block(page, SHORT, summary_table(listed, found))
+    if has_block(page, SHORT):
+        page = with_block(page, SHORT, summary_table(listed, found))
+    return with_block(page, FULL, real_table(listed, found))
+
+
+_COMMAND = "Command: `python -m benchmarks real -o OUT --captures DIR`."
+
+
+def _trainings(stored: StoredScene) -> str:
+    return f"mean of {stored.seeds} trainings" if stored.seeds > 1 else "one training"
+
+
+def _short(cells: Cells, column: str, variant: str) -> str:
+    psnr, refined, lpips = (
+        cells.spread("held-out", column, variant, metric) for metric in ("psnr", REFINED, "lpips_alex")
+    )
+    if psnr is None:
+        return "-"
+    text = f"{psnr.mean:.2f} / {'-' if lpips is None else f'{lpips.mean:.3f}'}"
+    return f"{text} ({refined.mean:.2f})" if refined else text
 
 
 def _figures(cells: Cells, column: str, variant: str) -> list[str]:
@@ -229,20 +334,3 @@ def showcase(path: Path, out: Path, found: Comparison) -> bool:
     tiles.append(Tile(read_rgb_float(images[view]), "reference"))
     write_rgb(path, contact_sheet([tiles], tile_width=480))
     return True
-
-
-def with_table(page: str, table: str) -> str:
-    """Return ``page`` with ``table`` between the lines ``<!-- real -->`` and ``<!-- /real -->``.
-
-    Raises:
-        InputError: if the page has no such lines.
-    """
-    if not _BLOCK.search(page):
-        raise InputError("the page has no place for the table", hint="add <!-- real --> and <!-- /real -->")
-    return _BLOCK.sub(lambda match: f"{match[1]}\n{table}\n\n{match[2]}", page)
-
-
-def table_of(page: str) -> str:
-    """Return what `with_table` put into ``page``; "" without a place for it."""
-    found = _BLOCK.search(page)
-    return found[0].removeprefix("<!-- real -->").removesuffix("<!-- /real -->").strip() if found else ""

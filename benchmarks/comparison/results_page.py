@@ -1,4 +1,7 @@
-"""Page of results: the template ``results.md`` with tables from `python -m benchmarks evidence`."""
+"""Pages behind the front page of the results, with tables from `python -m benchmarks evidence`.
+
+One page has the summary (the template ``results.md``), and each section has its own.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from pathlib import Path
 
 from benchmarks.comparison.cells import Cells, ViewSet
 from benchmarks.comparison.evidence import Section
+from benchmarks.comparison.front_page import FAULTS
 from benchmarks.comparison.gaps import VERDICTS, Gap, compared_with, is_worse, losses_table
 from benchmarks.comparison.saved_sections import SavedSection
 from benchmarks.comparison.tables import (
@@ -29,6 +33,8 @@ from benchmarks.comparison.variants import QUESTIONS, VARIANTS, WHOLE
 CONFIDENCE = "95 %"
 """Confidence of all intervals (`benchmarks.comparison.cells.student_t`)."""
 
+_MADE = "<!-- Made by `python -m benchmarks evidence`; edits are lost. -->"
+_OLDER = "This section was made from an older list of captures. The list has changed since."
 _QUICK = "This is the quick page (`--quick`): small images, short trainings, few captures."
 
 
@@ -51,8 +57,8 @@ def provenance(origin: Origin, found: Sequence[SavedSection]) -> str:
     return f"`{command}`, version {_join_unique(saved.version for saved in found)}"
 
 
-def results_page(found: Sequence[SavedSection], origin: Origin) -> str:
-    """Return the page as Markdown; it refers to pictures in ``results/`` with the names of the sections."""
+def summary_page(found: Sequence[SavedSection], origin: Origin) -> str:
+    """Return the page with losses, answers and methods as Markdown; it links to the pages of the sections."""
     template = Path(__file__).with_name("results.md").read_text(encoding="utf-8")
     nets = {metric for saved in found for metric in saved.results.cells.metrics()}
     missing = [NAMES[name] for name in ("lpips_alex", "lpips_vgg") if name not in nets]
@@ -69,11 +75,61 @@ def results_page(found: Sequence[SavedSection], origin: Origin) -> str:
         "answers": answers_table(found),
         "recipe": origin.recipe,
         "variants": "\n".join(_variant_rows()),
+        "faults": Table(
+            ["name", "fault (px: mean length at a width of 640 px)"],
+            [[f"`{name}`", words] for name, words in FAULTS.items()],
+        ).markdown(),
         "made": provenance(origin, found),
         "machine": _join_unique(saved.machine for saved in found),
-        "sections": "\n\n".join(_section(saved, origin) for saved in found),
+        "sections": _contents(found, origin),
     }
     return re.sub(r"@(\w+)@", lambda match: values[match[1]], template).rstrip() + "\n"
+
+
+def section_page(saved: SavedSection, origin: Origin) -> str:
+    """Return the page of a section as Markdown: pictures, tables, and reasons for missing results."""
+    section, line = saved.section, provenance(origin, [saved])
+    parts = [
+        f"# {section.title}",
+        _MADE,
+        f"{_conditions(section)} Made by version {saved.version}. [All sections](all.md) explains the names.",
+    ]
+    if section not in origin.sections:
+        parts.append(_OLDER)
+    if saved.missing:
+        parts.append("Not made:\n\n" + "\n".join(f"* {reason}" for reason in saved.missing))
+    if not saved.cells:
+        return "\n\n".join([*parts, f"No result of this section could be made ({line})."]) + "\n"
+    results, labels = saved.results, _labels()
+    cells = results.cells
+    parts.append(f"![Differences, {section.title}]({section.name}.png)")
+    if section.kind == "rooms":
+        parts.append(f"![Truth, input and scenes, {section.title}]({section.name}-sheet.jpg)")
+    for views in cells.view_sets():
+        parts += [f"## {TITLES[views]}", values_table(cells, views)]
+        if questions := questions_table(cells, views):
+            parts += ["Differences:", questions]
+    parts += ["## Work", work_table(cells, labels).markdown()]
+    parts += ["## Roles of the frames", roles_table(results.roles, labels).markdown()]
+    if results.choices:
+        parts += ["## Choices of RIVR against the truth", choices_table(results.choices, labels).markdown()]
+    elif section.kind == "video":
+        parts.append("The choices of RIVR cannot be evaluated here: the repaired frames have no truth.")
+    return "\n\n".join([*parts, line]) + "\n"
+
+
+def _contents(found: Sequence[SavedSection], origin: Origin) -> str:
+    """Return a table with a link to each section, its columns and its version."""
+    rows = [
+        [
+            f"[{saved.section.title}]({saved.section.name}.md)",
+            ", ".join(dict.fromkeys(cell.column for cell in saved.cells)),
+            str(saved.section.steps),
+            saved.version + (" (older list)" if saved.section not in origin.sections else ""),
+        ]
+        for saved in found
+    ]
+    return Table(["section", "captures", "steps", "version"], rows).markdown()
 
 
 def gaps(saved: Sequence[SavedSection]) -> list[tuple[str, Gap]]:
@@ -195,38 +251,6 @@ def _variant_rows() -> list[str]:
         scene = f"the scene of `{variant.stage}`"
         rows.append(f"| {variant.label} | {', '.join(changes) or 'nothing'}; {scene} |")
     return rows
-
-
-def _section(saved: SavedSection, origin: Origin) -> str:
-    """Return tables and pictures of a section, and the reasons for missing results."""
-    section, line = saved.section, provenance(origin, [saved])
-    parts = [f"## {section.title}", _conditions(section)]
-    if saved.missing:
-        parts.append("Not made:\n\n" + "\n".join(f"* {reason}" for reason in saved.missing))
-    if not saved.cells:
-        return "\n\n".join([*parts, f"No result of this section could be made ({line})."])
-    results, labels = saved.results, _labels()
-    cells = results.cells
-    for views in cells.view_sets():
-        parts += [f"### {TITLES[views]}", values_table(cells, views), line]
-        if questions := questions_table(cells, views):
-            parts += ["Differences:", questions, line]
-    parts += ["### Work", work_table(cells, labels).markdown(), line]
-    parts += ["### Roles of the frames", roles_table(results.roles, labels).markdown(), line]
-    if results.choices:
-        parts += [
-            "### Choices of RIVR against the truth",
-            choices_table(results.choices, labels).markdown(),
-            line,
-        ]
-    elif section.kind == "video":
-        parts.append("The choices of RIVR cannot be evaluated here: the repaired frames have no truth.")
-    parts += [
-        f"![Differences, {section.title}](results/{section.name}.png)",
-        f"![Truth, input and scenes, {section.title}](results/{section.name}-sheet.jpg)",
-        line,
-    ]
-    return "\n\n".join(parts)
 
 
 def _conditions(section: Section) -> str:

@@ -59,7 +59,8 @@ def save_section(folder: Path, found: SectionOutcome, version: str, machine: str
 def read_sections(folder: Path, sections: Iterable[Section], reporter: Reporter) -> list[SavedSection]:
     """Read the results of ``sections`` from ``folder``.
 
-    Unreadable files, and those that another list of evidence made, are left out with a warning.
+    Unreadable files are left out with a warning. A file of another list is read with one: its figures hold
+    for the captures and settings that are stored in it.
     """
     found = []
     for section in sections:
@@ -69,12 +70,11 @@ def read_sections(folder: Path, sections: Iterable[Section], reporter: Reporter)
         try:
             kept = SavedSection.model_validate_json(read_bytes(path))
         except (OSError, ValidationError):
-            reporter.warn(f"cannot read {path}: the page does not include {section.title!r}")
+            reporter.warn(f"cannot read {path}: the pages do not include {section.title!r}")
             continue
-        if kept.section == section:
-            found.append(kept)
-        else:
-            reporter.warn(f"{path} was made from another list: the page does not include {section.title!r}")
+        if kept.section != section:
+            reporter.warn(f"{path} was made from another list of evidence")
+        found.append(kept)
     return found
 
 

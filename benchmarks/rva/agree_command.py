@@ -134,7 +134,7 @@ def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> An
         document = merge(document, parse_override(text))
     change: dict[str, Any] = {"evaluator": evaluator}
     if model:
-        change["qwen"] = {"model": model, "model_dir": ""}
+        change["qwen"] = {"model": model}
     return check_document(dag, merge(document, {"rva": change})).sections["rva"]
 
 
@@ -152,9 +152,8 @@ def _own_cues(dag: Dag, run: Path, config: Any, frames: Sequence[Frame]) -> Eval
     wanted = key_config(config)
     if any(made.parts.config.get(name) != wanted[name] for name in ("evaluator", "qwen")):
         return None
-    externals = dag.load("rva").externals(config, Path())
     images = ingest.under("images")
-    if externals or made.parts.inputs["ingest"]["images"] != tree_digest(images):
+    if made.parts.inputs["ingest"]["images"] != tree_digest(images):
         return None
     table = read_table((run / "rva").resolve() / "frames.parquet", FRAMES)
     if table["frame_id"].to_pylist() != [frame.frame_id for frame in frames]:

@@ -257,7 +257,7 @@ class Batch:
 
 def program() -> list[str]:
     """Return the command that starts ``cleargs``, which does not need its script next to the interpreter."""
-    return module_command("cleargs.cli.entry")
+    return module_command("cleargs")
 
 
 def write_summary(path: Path, results: Sequence[Result]) -> None:

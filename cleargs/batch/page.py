@@ -18,8 +18,8 @@ from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
 from cleargs.report.formatting import count, duration
-from cleargs.report.frames import ImageFile, side_of, write_jpeg
 from cleargs.report.page import write_page
+from cleargs.report.pictures import ImageFile, side_of, write_jpeg
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 
 BYTES = 15_000_000

@@ -1,14 +1,12 @@
-"""The commands of ``cleargs``, in the groups of its help, and their names in printed commands."""
+"""The commands of ``cleargs``, in the groups of its help."""
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-import sys
 from collections.abc import Mapping
 from pathlib import Path
-from shlex import quote
+
+from cleargs.program import program
 
 SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Make": {
@@ -55,30 +53,9 @@ COMMANDS = {name: facts for commands in SECTIONS.values() for name, facts in com
 ALIASES = {"explain": "status"}
 """Old name of a command -> its name."""
 
-PROGRAM = "CLEARGS_PROGRAM"
-"""Environment variable with the words that start the program in the user's shell."""
-
 _PRINTED = re.compile(rf"(?<![\w./-])cleargs (?=(?:{'|'.join(COMMANDS)})\b)")
-
-
-def name_program() -> None:
-    """Store in the environment how this program is started, also for the processes that it starts.
-
-    It is ``cleargs`` where the shell finds this installation under that name, or else its path.
-    """
-    if PROGRAM in os.environ:
-        return
-    script, found = Path(sys.executable).with_name("cleargs"), shutil.which("cleargs")
-    if found is not None and (Path(found) == script or Path(found) == Path(sys.argv[0]).absolute()):
-        os.environ[PROGRAM] = "cleargs"
-    elif script.is_file():
-        here = Path.cwd()
-        os.environ[PROGRAM] = quote(str(script.relative_to(here) if script.is_relative_to(here) else script))
-    else:
-        os.environ[PROGRAM] = f"{quote(sys.executable)} -m cleargs.cli.entry"
 
 
 def as_called(text: str) -> str:
     """Return ``text`` with the commands in it as the user's shell understands them."""
-    program = os.environ.get(PROGRAM, "cleargs")
-    return text if program == "cleargs" else _PRINTED.sub(lambda match: f"{program} ", text)
+    return _PRINTED.sub(lambda match: f"{program(Path.cwd())} ", text)

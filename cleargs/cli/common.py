@@ -11,6 +11,7 @@ from typing import Any, TypeVar, get_args
 
 import click
 
+from cleargs.cli.commands import as_called
 from cleargs.cli.progress_bars import LOG, VERBOSE, LineFile
 from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest
@@ -195,6 +196,11 @@ def report_option(help: str) -> Callable[[F], F]:
     )
 
 
+def open_option(help: str) -> Callable[[F], F]:
+    """Return the option ``--open`` of a command that writes or serves a page; the command gets ``opens``."""
+    return click.option("--open", "opens", is_flag=True, help=help)
+
+
 def parse_size(
     context: click.Context, parameter: click.Parameter, value: str | None
 ) -> tuple[int, int] | None:
@@ -247,12 +253,12 @@ def print_json(value: Any) -> None:
 
 
 def answer(as_json: bool, facts: Any, *lines: str) -> None:
-    """Print ``facts`` as JSON, or else ``lines``."""
+    """Print ``facts`` as JSON, or else ``lines``, with commands as the user calls them."""
     if as_json:
         print_json(facts)
     else:
         for line in lines:
-            click.echo(line)
+            click.echo(as_called(line))
 
 
 def _limits(context: click.Context, parameter: click.Parameter, value: tuple[str, ...]) -> dict[str, float]:

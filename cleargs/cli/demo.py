@@ -7,14 +7,21 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import output_option, quality_option, quiet_option, store_option, work_options
+from cleargs.cli.common import (
+    open_option,
+    output_option,
+    quality_option,
+    quiet_option,
+    store_option,
+    work_options,
+)
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.run import run
 
 
 @click.command()
 @output_option("Folder of the demo.", "folder", required=False)
-@click.option("--open", "opens", is_flag=True, help="Open the report in the browser at the end.")
+@open_option("Open the report in the browser at the end.")
 @quality_option
 @work_options
 @store_option

@@ -1,4 +1,4 @@
-"""Entry point of the program ``cleargs``, also as ``python -m cleargs.cli.entry``."""
+"""Entry point of the program ``cleargs``, also as ``python -m cleargs``."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def main() -> None:
     # Waiting OpenMP threads should sleep: awake, they take a core from other programs, or even from the
     # thread for which they wait. PyTorch reads the variable when it is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    from cleargs.cli.commands import name_program
     from cleargs.cli.main import main as run
+    from cleargs.program import name_program
 
     name_program()
     try:
@@ -27,7 +27,3 @@ def main() -> None:
     finally:  # the command has ended: there is nothing left to interrupt
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-
-
-if __name__ == "__main__":
-    main()

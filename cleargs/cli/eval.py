@@ -38,9 +38,6 @@ _LABELS = {
     "musiq": "MUSIQ",
     "clip-iqa": "CLIP-\nIQA",
 }
-EXPOSURES_DIFFER = 0.5
-"""Gain of PSNR by aligned colours, dB, from which it is shown."""
-
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
 
@@ -196,17 +193,6 @@ def eval(
     return int(report_below({found.subject: found.means for found in report.evaluations}, fail_below))
 
 
-def _with_colours_aligned(evaluation: Evaluation) -> str:
-    """Return the line with the colour-aligned PSNR where exposures differ; "" where they do not."""
-    plain, aligned = evaluation.means.get("psnr"), evaluation.psnr_colour_aligned
-    if plain is None or aligned is None or aligned - plain < EXPOSURES_DIFFER:
-        return ""
-    return (
-        f"{_subject(evaluation)}: exposures differ: PSNR is {aligned:.2f} dB with the colours aligned to "
-        f"each reference (+{aligned - plain:.2f} dB); --align-colour gives all figures so"
-    )
-
-
 def _older(run: Path, path: Path) -> Report:
     """Return the evaluations in ``path`` of scenes that ``run`` still has."""
     from cleargs.evaluate.eval_report import Report, read_report
@@ -287,8 +273,6 @@ def _print(report: Report, output: Path | None) -> None:
         console.print(f"{metric}: {reason}")
     if output is not None:
         console.print(f"written: {output}")
-    for line in filter(None, map(_with_colours_aligned, report.evaluations)):
-        console.print(line)
 
 
 def _subject(evaluation: Evaluation) -> str:
@@ -308,7 +292,7 @@ def _provenance(evaluation: Evaluation) -> str:
 
 
 def _regions(evaluation: Evaluation) -> str:
-    """Return a line on regions in which scenes often fail."""
+    """Return a line with the PSNR in regions in which scenes often fail, and in other comparisons."""
     parts = {"behind the sparse points": evaluation.far, "clipped in the references": evaluation.clipped}
     words = [
         f"{name} {part.share:.1%} of the pixels, {_figure('psnr', part.psnr)} dB"
@@ -318,6 +302,8 @@ def _regions(evaluation: Evaluation) -> str:
     if evaluation.psnr_white is not None:
         between = _figure("psnr", evaluation.psnr_between)
         words.append(f"over white {evaluation.psnr_white:.2f} dB, {between} dB from black")
+    if evaluation.psnr_colour_aligned is not None:
+        words.append(f"with aligned colours {evaluation.psnr_colour_aligned:.2f} dB")
     return f"{_subject(evaluation)}: {'; '.join(words)}"
 
 

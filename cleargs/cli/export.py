@@ -70,11 +70,6 @@ Programs of --for:
     help="Keep the Gaussians in a box. Give two corners in the coordinates of cameras.json, or P for the "
     "middle P percent along each axis.",
 )
-@click.option(
-    "--spz-version",
-    type=click.Choice([3, 4]),
-    help="Version of a .spz file. 4 is newer; more programs read 3.  [default: 3]",
-)
 @scene_option
 @click.option(
     "--for",

@@ -14,6 +14,7 @@ from cleargs.errors import InputError
 from cleargs.files import atomic_path
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
+from cleargs.report.single_file import for_others
 from cleargs.run_results import scene_stage
 
 KEPT = ("manifest.json", "*.parquet", "colmap/**/*")
@@ -55,6 +56,8 @@ def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -
             content = file.read_bytes()
             if inside == RUN_FILE:
                 content = MADE_OF_NAMES.sub(r"\1\2", content.decode()).encode()
+            elif inside.endswith(".html"):
+                content = for_others(content.decode(), run.resolve()).encode()
             entry = zipfile.ZipInfo(f"{name}/{inside}")  # with a fixed date: equal runs give equal packs
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, content, zipfile.ZIP_DEFLATED)

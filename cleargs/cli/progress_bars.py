@@ -41,10 +41,7 @@ def make_reporter(quiet: bool = False) -> Reporter:
     def echo(text: str) -> None:
         click.echo(printable(as_called(text)), err=True)
 
-    def no_echo(text: str) -> None:
-        """Print nothing."""
-
-    say = no_echo if quiet else echo
+    say: Say = (lambda text: None) if quiet else echo
     if progress == "json":
         shown: Reporter = JsonReporter()
     elif progress == "auto" and sys.stderr.isatty() and not quiet:

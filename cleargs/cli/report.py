@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Sequence
 from contextlib import suppress
 from ipaddress import ip_address
@@ -16,6 +15,7 @@ from cleargs.cli.common import (
     FILE,
     answer,
     json_option,
+    open_option,
     quiet_option,
     run_argument,
     store_option,
@@ -28,6 +28,7 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import opened_store
+from cleargs.report.report_json import ENTRY
 
 
 @click.command(
@@ -43,6 +44,7 @@ Examples:
     "--single-file", is_flag=True, help="Also write the report as one HTML file, with everything inside."
 )
 @click.option("-o", "--output", type=FILE, help="File of --single-file.  [default: RUN/NAME-report.html]")
+@open_option("Open the report in the browser.")
 @threads_option
 @store_option
 @json_option
@@ -53,6 +55,7 @@ def report(
     run: Path,
     single_file: bool,
     output: Path | None,
+    opens: bool,
     threads: int,
     store: Path | None,
     as_json: bool,
@@ -69,14 +72,17 @@ def report(
     reporter = make_reporter(quiet)
     with opened_store(settings.store) as opened:
         page = write_report(Planner(dag, settings, opened, threads, reporter))
+    address = (settings.folder / ENTRY).as_uri()
     facts: dict[str, Any] = {"report": str(page)}
-    line = f"report: {page}"
+    lines = [f"report: {address}"]
     if single_file:
         target = output or run / f"{run.resolve().name}-report.html"
         size = write_single_file(page, target)
         facts |= {"single_file": str(target), "bytes": size}
-        line = f"written: {target} ({size / 1e6:.1f} MB)"
-    answer(as_json, facts, line)
+        lines = [f"written: {target} ({size / 1e6:.1f} MB)"]
+    answer(as_json, facts, *lines)
+    if opens:
+        click.launch(address)
 
 
 def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
@@ -85,7 +91,7 @@ def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path
     Returns:
         The page, or None if no frames exist or writing failed (with a warning).
     """
-    from cleargs.report.report_json import LastRun, is_current, linked_manifests, page_of
+    from cleargs.report.report_json import is_current, linked_manifests, page_of
 
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
@@ -95,10 +101,8 @@ def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path
         return page_of(run)
     from cleargs.report.page import write_report
 
-    usage = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    last = LastRun({outcome.stage: outcome.how for outcome in outcomes}, round(max(usage) * 1024 / 1e9, 2))
     try:
-        return write_report(planner, last)
+        return write_report(planner)
     except CleargsError as error:  # the run itself has succeeded
         planner.reporter.warn(f"no report was written: {error}; {error.hint}")
         return None
@@ -117,7 +121,7 @@ def outdated_report_note(run: Path, dag: Dag) -> str:
 @click.command(
     epilog="""\b
 Examples:
-  cleargs watch room                     prints the address to open in your browser
+  cleargs watch room --open              in your browser
   cleargs watch room --port 8000
   ssh -L 8000:localhost:8000 HOST cleargs watch room --port 8000      a run on another machine
 
@@ -139,9 +143,10 @@ It updates itself. After the run, it shows the report.
     default=0,
     help="Port to listen on.  [default: any free port]",
 )
+@open_option("Open the page in the browser.")
 @store_option
 @click.pass_obj
-def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None:
+def watch(dag: Dag, run: Path, host: str, port: int, opens: bool, store: Path | None) -> None:
     """Serve a page with the progress of RUN, and later its report, until Ctrl-C."""
     from cleargs.report.serve import Server
 
@@ -152,5 +157,7 @@ def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None
         if not loopback:
             click.echo(f"warning: anyone who can connect to {host} can read the report of this run", err=True)
         click.echo(f"{server.address}  (stop with Ctrl-C)")
+        if opens:
+            click.launch(server.address)
         with suppress(KeyboardInterrupt):
             server.serve_forever()

@@ -19,6 +19,7 @@ from cleargs.cli.common import (
     json_option,
     kept_log,
     manifest_json,
+    open_option,
     output_option,
     partial_option,
     print_json,
@@ -40,7 +41,7 @@ from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.errors import StageError
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.plan import Planner, StagePlan, cost_line
+from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_of
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
 from cleargs.pipeline.session import (
@@ -113,7 +114,7 @@ Files in RUN:
     help="Run this stage even if its results exist.",
 )
 @report_option("Write RUN/report.html at the end, which opens the report.")
-@click.option("--open", "opens", is_flag=True, help="Open the report in the browser at the end.")
+@open_option("Open the report in the browser at the end.")
 @click.option("--dry-run", is_flag=True, help="Only show which stages would run, why, and the cost.")
 @partial_option
 @work_options
@@ -379,12 +380,12 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
 
 
 def print_plans(plans: list[StagePlan], as_json: bool) -> None:
-    """Print the state of each stage with its reasons, then the expected cost."""
+    """Print the state and cost of each stage, with its reasons, then the cost of all."""
     lines, facts = [], []
     for plan in plans:
         first, *others = plan.reasons or ("",)
-        lines.append(f"{plan.stage:<12} {plan.state:<8} {first}".rstrip())
-        lines += [f"{'':<21} {reason}" for reason in others]
+        lines.append(f"{plan.stage:<12} {plan.state:<8} {cost_of(plan):<37} {first}".rstrip())
+        lines += [f"{'':<59} {reason}" for reason in others]
         figures = ("minutes", "memory_gb", "disk_gb")
         estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}
         known = {"stage": plan.stage, "state": plan.state, "key": plan.key, "reasons": list(plan.reasons)}

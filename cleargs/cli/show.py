@@ -12,6 +12,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
     FILE,
     answer,
@@ -22,6 +23,7 @@ from cleargs.cli.common import (
     run_argument,
     stage_names,
 )
+from cleargs.cli.frame_rows import frame_rows, reason, short_name
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.parquet import read_any_table, read_table
@@ -34,7 +36,6 @@ if TYPE_CHECKING:
     from cleargs.report.frames import FrameRow
 
 MAX_LISTED = 16  # items of a list that are printed
-MAX_NAME_LENGTH = 14  # characters of a frame's name in a table
 LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; width in px
 HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
 
@@ -138,7 +139,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
         rows.append([name, manifest.status, *cells, text])
     _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
     if None in manifests.values():
-        click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
+        click.echo(as_called(f"not done: see cleargs status {quote(str(run.folder))}"))
     if work := running_stage(run.folder, run.store):
         count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
         click.echo(f"\n{work.stage} is running: {', '.join(filter(None, (work.label, count, work.note)))}")
@@ -180,7 +181,7 @@ def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bo
         title = f"\n{name}: {tables[name].num_rows} rows"
         _print_table(fields, "column", "meaning", title=title, wraps="meaning")
     if not columns:
-        click.echo(f"\nall columns: cleargs show {quote(str(run))} {stage} --columns")
+        click.echo(as_called(f"\nall columns: cleargs show {quote(str(run))} {stage} --columns"))
 
 
 def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -222,76 +223,6 @@ def text_of(value: Any) -> str:
                 return ", ".join(f"{names[name]} {text_of(item)}" for name, item in value.items())
             return ", ".join(f"{count} {names[name]}" for name, count in value.items() if count) or "none"
     return str(value)
-
-
-# -- all frames ---------------------------------------------------------------------------------------------
-
-
-def frame_rows(
-    rows: Sequence[Mapping[str, Any]],
-    settings: Mapping[str, Any],
-    repairs: Sequence[Mapping[str, Any]] | None,
-) -> list[dict[str, Any]]:
-    """Return role, scores, worst cue, reason and repair of each row of ``rva/frames.parquet``.
-
-    ``settings`` are those of RVA that made the rows. ``repairs`` are the rows of ``rivr/selection.parquet``;
-    None before RIVR, when frames have no "repair".
-    """
-    from cleargs.report.frames import worst_cue
-
-    latest = {row["frame_id"]: row for row in sorted(repairs or (), key=lambda row: int(row["round"]))}
-    found = []
-    for row in rows:
-        line = {"frame": row["frame_id"], **{key: row[key] for key in ("name", "role", "weight", "R", "B")}}
-        line |= {"worst cue": worst_cue(row), "reason": reason(row, settings)}
-        if repairs is not None:
-            line["repair"] = _repair(latest.get(row["frame_id"]))
-        found.append(line)
-    return found
-
-
-def short_name(name: str) -> str:
-    """Return the end of a frame's name, which differs most between frames."""
-    last = name.rpartition("/")[2]
-    return last if len(last) <= MAX_NAME_LENGTH else f"…{last[1 - MAX_NAME_LENGTH :]}"
-
-
-def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    """Return the reason for the role of a frame: the threshold that it passed or missed."""
-    if row["R"] is None:
-        return "not scored"
-    if row["G"] is None:
-        return "no pose found"
-    if not settings["enabled"]:
-        return "all frames count"
-    if row["role"] == "strong":
-        return "reliable"
-    if settings["weighting"] == "binary":
-        return "among the best" if row["role"] == "auxiliary" else "not among the best"
-    low = _missed(row, settings["auxiliary_R"], settings["auxiliary_B"])
-    missed = low or _missed(row, settings["tau_R"], settings["tau_B"])
-    if row["reactivated_for"] == "coverage":
-        return f"{missed}, fills a gap"
-    weak = missed if low else f"{missed}, no new view"
-    return {"geometric": f"{missed}, adds views", "auxiliary": f"{missed}, usable"}.get(row["role"], weak)
-
-
-def _missed(row: Mapping[str, Any], min_R: float, max_B: float) -> str:
-    """Return the first of the two thresholds that the frame misses; "" if it misses none."""
-    if row["R"] < min_R:
-        return f"R < {min_R:.4g}"
-    return f"B > {max_B:.4g}" if row["B"] > max_B else ""
-
-
-def _repair(row: Mapping[str, Any] | None) -> str:
-    """Return RIVR's choice in the last round of a frame: a layer, "as filmed", "refused" or "none"."""
-    from cleargs.rivr.gates import REFUSED
-
-    if row is None:
-        return "none"
-    if row["chosen"] == "observed":
-        return "as filmed"
-    return "refused" if not row["accepted"] or row["reason"].startswith(REFUSED) else str(row["chosen"])
 
 
 # -- one frame -----------------------------------------------------------------------------------------------
@@ -340,14 +271,8 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     """
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
-    from cleargs.report.frames import (
-        LAYERS,
-        camera_of,
-        formed_layers,
-        last_scene,
-        layers_of,
-        scene_with_models,
-    )
+    from cleargs.report.frames import camera_of, last_scene, scene_with_models
+    from cleargs.report.pictures import LAYERS, formed_layers, layers_of
     from cleargs.splat.ply import read_ply
     from cleargs.splat.render import Viewer
 

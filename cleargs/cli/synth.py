@@ -24,7 +24,6 @@ Example:
   cleargs synth room --protocol mixed --frames 16 --size 480x270
   cleargs run room -o run                         use the given poses
   cleargs run room -o run --set ingest.poses=sfm  estimate the poses from the images
-  cleargs synth clip --protocol phone --seconds 60 --fps 30 --size 960x540
 
 \b
 Protocols, with mean lengths at a width of 640 px:
@@ -54,14 +53,6 @@ Protocols, with mean lengths at a width of 640 px:
 @click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of room and path.")
 @click.option("--video", is_flag=True, help="Also write OUT/capture.mp4.")
-@click.option(
-    "--seconds", type=click.FloatRange(0.1, 600), help="Length of the walk.  [default: 1/6 s per frame]"
-)
-@click.option(
-    "--fps",
-    type=click.FloatRange(1, 120),
-    help="Frame rate of OUT/capture.mp4, which then shows the whole walk; --frames have ground truth.",
-)
 @json_option
 def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> None:
     """Make a synthetic handheld capture of a procedural room in the new folder OUT.

@@ -1,6 +1,6 @@
 """The frozen restoration expert of RIVR: it maps an image to a sharper image of the same size.
 
-Any restoration network in an ONNX file can be used: NCHW or NHWC, fixed or free size. The embedded default
+Any restoration network in an ONNX file can be used, of a fixed or free input size. The embedded default
 was trained by `tools/train_models/train_restorer.py`.
 """
 
@@ -28,9 +28,9 @@ class Expert(Network, Protocol):
 class OnnxExpert:
     """A restoration network in an ONNX file, applied to overlapping tiles (on a GPU in batches).
 
-    The network maps an image [1, 3, H, W] or [1, H, W, 3], float32 sRGB in [0, 1], to an image of the same
-    size in either layout. Its first output is used. A fixed input size is the size of the tiles. ``name`` is
-    for tables (None: the file name without its extension); ``device`` is a result of `network_device`.
+    The network maps an image [1, 3, H, W], float32 sRGB in [0, 1], to an image of the same size. Its first
+    output is used. A fixed input size is the size of the tiles. ``name`` is for tables (None: the file name
+    without its extension); ``device`` is a result of `network_device`.
 
     Raises:
         InputError: The file is missing, is not an ONNX model, or has other inputs.
@@ -39,16 +39,15 @@ class OnnxExpert:
     def __init__(self, path: Path, name: str | None = None, device: Device = "cpu") -> None:
         model = OnnxModel(path, device)
         shape = model.inputs[0] if len(model.inputs) == 1 else ()
-        if len(shape) != 4 or shape[0] not in (None, 1) or 3 not in (shape[1], shape[3]):
+        if len(shape) != 4 or shape[0] not in (None, 1) or shape[1] != 3:
             raise InputError(
                 f"{path} does not take one RGB image: its inputs are {model.inputs}",
-                hint="use a restoration model that takes [1, 3, H, W] or [1, H, W, 3]",
+                hint="use a restoration model that takes [1, 3, H, W]",
             )
         if not model.takes_floats:
             raise InputError(f"{path} does not take float32 values", hint="export the model in float32")
         self._model = model
-        self._channels_first = shape[1] == 3
-        self._fixed = (shape[2], shape[3]) if self._channels_first else (shape[1], shape[2])
+        self._fixed = (shape[2], shape[3])
         self.name = name or path.stem
         self.digest = model.digest
 
@@ -66,15 +65,14 @@ class OnnxExpert:
 
     def _restore(self, tiles: ImageF32) -> ImageF32:
         """Restore tiles [N, h, w, 3]."""
-        batch = tiles.transpose(0, 3, 1, 2) if self._channels_first else tiles
-        output = self._model.run(np.ascontiguousarray(batch, np.float32))[0]
-        restored = output.transpose(0, 2, 3, 1) if output.ndim == 4 and output.shape[1] == 3 else output
-        if restored.shape != tiles.shape:
+        batch = np.ascontiguousarray(tiles.transpose(0, 3, 1, 2), np.float32)
+        output = self._model.run(batch)[0]
+        if output.shape != batch.shape:
             raise InputError(
-                f"the restoration expert {self.name} maps {tiles.shape} to {output.shape}",
+                f"the restoration expert {self.name} maps {batch.shape} to {output.shape}",
                 hint="use a restoration model that returns an image of the same size",
             )
-        return np.asarray(restored, np.float32)
+        return np.asarray(output.transpose(0, 2, 3, 1), np.float32)
 
 
 def load_expert(spec: str, device: Device = "cpu") -> Expert:

@@ -158,10 +158,36 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
     sections: dict[str, BaseModel] = {}
     for name, model in models.items():
         try:
-            sections[name] = model.model_validate(document.get(name, {}), context=sections)
+            sections[name] = model.model_validate(document.get(name, {}))
         except ValidationError as error:
             raise _setting_error(name, models, error) from error
     return Config(seed, sections, {name: _effective(dag.load(name), name, sections) for name in sections})
+
+
+def known_settings(dag: Dag, document: Mapping[str, Any]) -> tuple[Document, list[str]]:
+    """Return the settings of ``document`` that this version has, and the names of the others.
+
+    Files of runs that another version wrote can have others.
+    """
+    tables = {name: dag.load(name).CONFIG for name in dag.names}
+    known: Document = {"seed": document["seed"]} if "seed" in document else {}
+    others = [name for name in document if name not in (*tables, "seed")]
+    for name, model in tables.items():
+        if name in document:
+            known[name] = _known(document[name], model, name, others)
+    return known, others
+
+
+def _known(table: Any, model: Any, place: str, others: list[str]) -> Any:
+    """Return ``table`` without the settings that ``model`` does not have, which are added to ``others``."""
+    if not (isinstance(table, dict) and isinstance(model, type) and issubclass(model, BaseModel)):
+        return table
+    others += [f"{place}.{name}" for name in table if name not in model.model_fields]
+    return {
+        name: _known(table[name], field.annotation, f"{place}.{name}", others)
+        for name, field in model.model_fields.items()
+        if name in table
+    }
 
 
 def _effective(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> BaseModel:
@@ -176,11 +202,6 @@ def _setting_error(
     """Return the error for the first fault that pydantic found."""
     first = error.errors(include_url=False)[0]
     name = ".".join([section, *map(str, first["loc"])])
-    if first["type"] == "retired":
-        retired = first["ctx"]
-        return ConfigError(
-            f"{name}.{retired['name']} = {retired['value']!r} is no longer a setting", hint=retired["hint"]
-        )
     if first["type"] == "extra_forbidden":
         return _unknown_setting(name, models)
     known = {setting.name: setting for setting in settings_of(section, models[section])}

@@ -306,10 +306,22 @@ def cost_line(plans: list[StagePlan]) -> str:
     costs = [(plan.stage, plan.estimate) for plan in plans if plan.estimate is not None]
     if not costs:
         return ""
-    whole = _time(sum(cost.minutes for _, cost in costs))
+    whole = Estimate(
+        sum(cost.minutes for _, cost in costs),
+        max(cost.memory_gb for _, cost in costs),
+        sum(cost.disk_gb for _, cost in costs),
+    )
     stages = ", ".join(f"{stage} {_time(cost.minutes)}" for stage, cost in costs)
-    memory, disk = max(cost.memory_gb for _, cost in costs), sum(cost.disk_gb for _, cost in costs)
-    return f"estimate: about {whole}, {memory:.1f} GB memory, {_size(disk)} disk ({stages})"
+    return f"estimate: about {_cost(whole)} ({stages})"
+
+
+def cost_of(plan: StagePlan) -> str:
+    """Return the expected time, memory and disk of a stage with work to do; "" without any."""
+    return _cost(plan.estimate) if plan.estimate is not None else ""
+
+
+def _cost(cost: Estimate) -> str:
+    return f"{_time(cost.minutes)}, {cost.memory_gb:.1f} GB memory, {_size(cost.disk_gb)} disk"
 
 
 def check_disk(plans: list[StagePlan], store: Path) -> None:

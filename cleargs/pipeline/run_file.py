@@ -10,7 +10,7 @@ import tomli_w
 
 from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_errors, write_bytes
-from cleargs.pipeline.config import Config, Document, check_document, read_toml
+from cleargs.pipeline.config import Config, Document, check_document, known_settings, read_toml
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.stage import Device as Device
 from cleargs.pipeline.store import STORE_FOLDER
@@ -155,7 +155,8 @@ def read_run_file(
     metadata = read_metadata(folder)
     if metadata.source is None or metadata.damaged:
         raise damaged_run_file(folder)
-    config = check_document(dag, metadata.settings)
+    settings, _ = known_settings(dag, metadata.settings)
+    config = check_document(dag, settings)
     place = store or metadata.store or folder / STORE_FOLDER
     on_cpu, chosen = (metadata.on_cpu, metadata.device) if device is None else ((), device)
     return RunSpec(folder, metadata.source, config, place, chosen or "cpu", on_cpu, device is None)

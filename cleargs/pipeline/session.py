@@ -11,7 +11,7 @@ from typing import Literal
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
 from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
-from cleargs.pipeline.config import check_document, load_config
+from cleargs.pipeline.config import check_document, known_settings, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
     RUN_FILE,
@@ -131,8 +131,10 @@ def resolve_run(
         metadata = read_metadata(folder)
         if metadata.damaged:
             raise damaged_run_file(folder)
-        # The check drops retired settings. In the raw document they could contradict the overrides.
-        kept = check_document(dag, metadata.settings) if metadata.settings and not forgets else None
+        settings, others = known_settings(dag, {} if forgets else metadata.settings)
+        kept = check_document(dag, settings) if settings else None
+        if others:
+            say(f"settings of {folder / RUN_FILE} that this version does not have: {_listed(others)}")
     except ConfigError as error:
         if not forgets:
             raise ConfigError(
@@ -145,10 +147,13 @@ def resolve_run(
     if kept is not None:
         own = [f"seed={kept.seed}"] if kept.seed else []
         own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
-        line = ", ".join(own[:MAX_LISTED]) + (
-            f" and {len(own) - MAX_LISTED} more" if own[MAX_LISTED:] else ""
-        )
         if own:
-            say(f"settings kept from {folder / RUN_FILE}: {line}; --reset starts from the recipe")
+            say(f"settings kept from {folder / RUN_FILE}: {_listed(own)}; --reset starts from the recipe")
     on_cpu = metadata.on_cpu if keeps else ()
     return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")
+
+
+def _listed(items: Sequence[str]) -> str:
+    """Return the first of ``items`` in one line, and the number of the others."""
+    more = f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else ""
+    return ", ".join(items[:MAX_LISTED]) + more

@@ -23,7 +23,7 @@ from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
 from cleargs.run_results import SCENE
 from cleargs.splat.camera import Camera, cameras_json
-from cleargs.splat.formats import check_options, format_of, padded, write_scene
+from cleargs.splat.formats import check_up, format_of, padded, write_scene
 from cleargs.splat.ply import read_ply
 from cleargs.splat.transforms import far_offset, orient_up, transform_scene
 
@@ -41,7 +41,6 @@ class ExportOptions:
     sh_degree: int | None = None
     prune: Sequence[str] = ()
     crop: str | None = None
-    spz_version: int | None = None
     cameras: bool = False
     """Write cameras and COLMAP model too."""
     force: bool = False
@@ -58,12 +57,13 @@ def export_scene(
     """
     kinds = [format_of(output) for output in outputs]
     for kind in kinds:
-        check_options(kind, up=options.up, spz_version=options.spz_version)
+        check_up(kind, options.up)
     if options.up is not None and options.world == "input":
         raise InputError("--up and --world input exclude each other", hint="give one of them")
     thresholds, region = parse_prune(options.prune), parse_crop(options.crop)
     for output in outputs:
-        _require_free(output, options)
+        if output.exists() and not options.force:
+            raise InputError(f"{output} exists already", hint="choose another name, or give --force")
     ingest = run / "ingest"
     posed = [frame for frame in load_frames(ingest) if frame.registered]
     cameras = {frame.frame_id: (frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed}
@@ -98,8 +98,7 @@ def export_scene(
             output.parent.mkdir(parents=True, exist_ok=True)
         if options.cameras:
             _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
-        version = options.spz_version if kind == "spz" else None
-        write_scene(output, scene, kind, turned=options.up is not None, spz_version=version)
+        write_scene(output, scene, kind, turned=options.up is not None)
     axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
     count = scene.gaussians.num
     return [*messages, *(f"{output}: scene of {stage}, {count} Gaussians, {axes}" for output in outputs)]
@@ -107,11 +106,6 @@ def export_scene(
 
 def _stem(output: Path) -> str:
     return output.name[: -len(format_of(output)) - 1]
-
-
-def _require_free(output: Path, options: ExportOptions) -> None:
-    if output.exists() and not options.force:
-        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
 
 
 def _similarity(

@@ -22,6 +22,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
+from cleargs.program import program
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
@@ -30,8 +31,6 @@ from cleargs.splat.config import steps_from_frames
 
 FEW_PLACED = 0.8
 """Share of frames with a pose, below which there is advice on them."""
-MANY_UNUSED = 0.4
-"""Share of placed frames with weight 0, above which there is advice on the thresholds."""
 BLURRED_PX = 6.0
 """Motion blur above which a frame counts as blurred, px."""
 SHORT = 0.8
@@ -62,9 +61,7 @@ def shown_advice(
     if not any(advice.options and advice.worth for advice in found):
         found = [advice for advice in found if advice.worth]
     return [
-        advice._replace(
-            command=shlex.join([*_base(planner.run), *advice.options]), time=_time(planner, advice.options)
-        )
+        advice._replace(command=_command(planner.run, advice.options), time=_time(planner, advice.options))
         if advice.options
         else advice
         for advice in found
@@ -74,14 +71,16 @@ def shown_advice(
 def command(run: RunSpec, dag: Dag) -> str:
     """Return the ``cleargs run`` command that reproduces a run, to be called next to its folder."""
     recipe, changed = _nearest_recipe(run.config, dag)
-    words = [*_base(run), *(["--recipe", recipe] if recipe != "default" else [])]
+    words = ["--recipe", recipe] if recipe != "default" else []
     words += ["--seed", str(changed.pop("seed"))] if "seed" in changed else []
-    return shlex.join(words + _set(changed))
+    return _command(run, words + _set(changed))
 
 
-def _base(run: RunSpec) -> list[str]:
-    """Return the words of ``cleargs run`` for a capture and a run folder, called next to the run folder."""
-    return ["cleargs", "run", os.path.relpath(run.source, run.folder.parent), "-o", run.folder.name]
+def _command(run: RunSpec, options: Sequence[str]) -> str:
+    """Return ``cleargs run`` for a capture and a run folder, to be called next to the run folder."""
+    place = run.folder.parent
+    words = ["run", os.path.relpath(run.source, place), "-o", run.folder.name, *options]
+    return f"{program(place)} {shlex.join(words)}"
 
 
 def _nearest_recipe(config: Config, dag: Dag) -> tuple[str, dict[str, Any]]:
@@ -135,7 +134,6 @@ class _Advisor:
     def __init__(self, planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> None:
         self._config, self._dag = planner.run.config, planner.dag
         self._manifests, self._rows = manifests, rows
-        self._placed = [row for row in rows if row.frame.registered]
 
     def _figure(self, stage: str, *path: str) -> Any:
         return figure_of(self._manifests, stage, *path)
@@ -149,7 +147,6 @@ class _Advisor:
             for missing in manifest.missing:
                 yield Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
         yield from self._on_frames()
-        yield from self._on_weights()
         if "g0" in self._manifests:
             yield from self._on_training()
 
@@ -191,23 +188,6 @@ class _Advisor:
                 0.0,
                 ("--set", "ingest.holdout=every:8"),
             )
-
-    def _on_weights(self) -> Iterator[Advice]:
-        """Yield advice on the weights of the frames."""
-        lower = {"rva.tau_R": round(max(self._setting("rva", "tau_R") - 0.1, 0.0), 2)}
-        if self._figure("rva", "stand_in"):
-            higher = {"rva.tau_B": round(min(self._setting("rva", "tau_B") + 0.1, 1.0), 2)}
-            what = "No frame counts as reliable, so the best ones are used"
-            why = "Thresholds closer to the scores of this capture separate good frames from bad ones."
-            yield Advice(what, why, NO_FIGURE, 0.3, tuple(_set(lower | higher)))
-        if uncovered := self._figure("rva", "bins_uncovered_before"):
-            what = f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame"
-            yield Advice(what, "The scene may be softer there. Film more slowly there.", NO_FIGURE, 0.2)
-        weighted = sum(row.weight is not None for row in self._placed)
-        unused = sum(row.weight == 0.0 for row in self._placed)
-        if weighted and unused > MANY_UNUSED * weighted:
-            what, why = f"{unused} of {weighted} placed frames are not used", "A lower threshold uses more."
-            yield Advice(what, why, NO_FIGURE, 0.4, tuple(_set(lower)))
         blurred = sum((row.motion("blur_px") or 0.0) > BLURRED_PX for row in self._rows)
         if blurred > len(self._rows) / 2:
             what = f"{count(blurred, 'frame has', 'frames have')} more than {BLURRED_PX:g} px of motion blur"

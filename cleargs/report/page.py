@@ -22,14 +22,13 @@ from cleargs.manifest import plain_json
 from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.plan import Planner, StagePlan
+from cleargs.program import program
 from cleargs.report.advice import command, shown_advice, toml_text
 from cleargs.report.formatting import duration
 from cleargs.report.frames import (
     CHOICES,
-    LAYERS,
     MEANINGS,
     SCENES,
-    FramePictures,
     FrameRow,
     camera_of,
     faults_of,
@@ -37,15 +36,12 @@ from cleargs.report.frames import (
     scene_with_models,
     scores_of,
     worst_cue,
-    write_jpeg,
-    write_pictures,
 )
+from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
 from cleargs.report.report_json import (
     ENTRY,
     PAGE,
-    LastRun,
     cameras_of,
-    last_run,
     linked_manifests,
     page_of,
     write_report_json,
@@ -90,10 +86,8 @@ def page_environment() -> Environment:
     return environment
 
 
-def write_report(planner: Planner, last: LastRun | None = None) -> Path:
+def write_report(planner: Planner) -> Path:
     """Write the report of a run atomically, in place of an older one. Return the path of its page.
-
-    ``last`` is the work of the last ``cleargs run`` (default: as in the older report).
 
     Raises:
         InputError: if no stage of the run is finished.
@@ -103,7 +97,6 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
         raise InputError(f"no stage of {run} is finished", hint=f"see cleargs status {run}")
-    last = last or last_run(run)
     set_threads(planner.threads)
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
@@ -146,10 +139,10 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             manifests=manifests,
             cameras=cameras_of(manifests),
             plans=plans,
-            last=last,
             settings=changed_settings(planner.run.config),
             versions=versions,
             command=command(planner.run, planner.dag),
+            program=program(run.parent),
             aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
             data={
                 "layers": LAYERS,
@@ -161,8 +154,10 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
                 "training": training_curves(run, trained),
             },
         )
-        write_report_json(folder, manifests, last)
-    leads_to_it = page_environment().get_template("entry.html.jinja").render(name=run.name)
+        write_report_json(folder, manifests)
+    leads_to_it = (
+        page_environment().get_template("entry.html.jinja").render(name=run.name, program=program(run.parent))
+    )
     write_bytes(run / ENTRY, leads_to_it.encode())
     return page_of(run)
 

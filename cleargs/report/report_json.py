@@ -1,9 +1,8 @@
-"""``report.json``, next to the page: the results that the report shows, and the work of the last run."""
+"""``report.json``, next to the page: the results that the report shows."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,6 @@ from cleargs.safe_io import read_json
 FOLDER, PAGE, REPORT_JSON = "report", "index.html", "report.json"
 ENTRY = "report.html"
 """File in the run folder that leads to the report."""
-
-
-@dataclass(frozen=True)
-class LastRun:
-    """The work of the last ``cleargs run``, which manifests do not record."""
-
-    stages: Mapping[str, str]
-    """Stage -> "made" if it ran, "found" if its results were up to date."""
-    peak_memory_gb: float
 
 
 def page_of(run: Path) -> Path:
@@ -54,21 +44,9 @@ def _read_report(run: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def last_run(run: Path) -> LastRun | None:
-    """Return the last run as recorded in the present report; None without it."""
-    try:
-        return LastRun(**_read_report(run)["last_run"])
-    except (KeyError, TypeError):
-        return None
-
-
-def write_report_json(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
+def write_report_json(folder: Path, manifests: Mapping[str, Manifest]) -> None:
     """Write ``report.json`` into the ``folder`` of a report."""
-    content = {
-        "made_from": _made_from(manifests),
-        "last_run": asdict(last) if last else None,
-        "cameras": cameras_of(manifests),
-    }
+    content = {"made_from": _made_from(manifests), "cameras": cameras_of(manifests)}
     write_json(folder / REPORT_JSON, content)
 
 

@@ -7,7 +7,10 @@ import json
 import re
 from pathlib import Path
 
+from markupsafe import escape
+
 from cleargs.files import write_bytes
+from cleargs.program import program
 
 _SCRIPTS = ("viewer.js", "scene.js")
 _DATA = '<script type="application/json" id="data">'  # the scripts and images are put in front of it
@@ -32,7 +35,7 @@ def write_single_file(page: Path, target: Path) -> int:
         file.relative_to(folder).as_posix(): "data:image/jpeg;base64," + _base64(file)
         for file in sorted(folder.rglob("*.jpg"))
     }
-    html, shown = page.read_text(encoding="utf-8"), set()
+    html, shown = for_others(page.read_text(encoding="utf-8"), folder.parent), set()
 
     def with_content(link: re.Match[str]) -> str:
         shown.add(link[1])
@@ -46,6 +49,11 @@ def write_single_file(page: Path, target: Path) -> int:
     data = html.replace(_DATA, inside + _DATA, 1).encode()
     write_bytes(target, data)
     return len(data)
+
+
+def for_others(html: str, run: Path) -> str:
+    """Return a page of ``run`` whose commands do not have the path of this machine's program."""
+    return html.replace(f"{escape(program(run.parent))} ", "cleargs ")
 
 
 def _base64(file: Path) -> str:

@@ -26,13 +26,6 @@ HEADLINES: Mapping[Tone, str] = {
     "poor": "Poor: the scene matches the video only loosely.",
 }
 
-FIGURES = (
-    ("psnr_unseen", "PSNR on pixels that no training used"),
-    ("psnr_strong", "PSNR on the best training frames"),
-    ("psnr_active", "PSNR on the training frames"),
-)
-"""Figures of a scene that may be the headline, the best one first, with their meanings."""
-
 
 class Verdict(NamedTuple):
     """The first lines of a report."""
@@ -41,8 +34,7 @@ class Verdict(NamedTuple):
     headline: str
     text: str
     figure: str
-    """PSNR in dB; "" if it is unknown."""
-    meaning: str
+    """PSNR in dB of pixels that no training used; "" if it is unknown."""
 
 
 def figure_of(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
@@ -55,22 +47,15 @@ def figure_of(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
 
 def verdict(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> Verdict:
     """Return the first lines of a report. ``unseen`` is the PSNR, dB, of each frame that was held out."""
-    psnr, meaning = _headline_figure(manifests)
+    known = [figure_of(manifests, stage, "psnr_unseen") for stage in reversed(SCENES)]
+    psnr = next((value for value in known if value is not None), None)
     text = _text(manifests, rows, unseen)
     if psnr is None:
         trained = "g0" in manifests
         headline = "The scene is trained." if trained else "The capture is prepared. No scene is trained yet."
-        return Verdict("fair", headline, text, "", "")
+        return Verdict("fair", headline, text, "")
     tone: Tone = "good" if psnr >= CLOSE_DB else "fair" if psnr >= LOOSE_DB else "poor"
-    return Verdict(tone, HEADLINES[tone], text, f"{psnr:.1f}", meaning)
-
-
-def _headline_figure(manifests: Mapping[str, Manifest]) -> tuple[float | None, str]:
-    for name, meaning in FIGURES:
-        for stage in reversed(SCENES):
-            if (value := figure_of(manifests, stage, name)) is not None:
-                return float(value), meaning
-    return None, ""
+    return Verdict(tone, HEADLINES[tone], text, f"{psnr:.1f}")
 
 
 def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> str:

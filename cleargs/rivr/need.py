@@ -18,7 +18,7 @@ from cleargs.rivr.tables import Selection
 from cleargs.rivr.targets import FrameAssessment, Supervision
 from cleargs.rva.allocation import Role
 
-Targets: TypeAlias = Literal["auto", "all", "degraded"]
+Targets: TypeAlias = Literal["auto", "all"]
 
 UNEXPLAINED = 2.0
 """Misfit over the median misfit from which a frame is in need: it has less than half a weight of trust, see
@@ -81,13 +81,12 @@ def frames_to_repair(
 ) -> list[int]:
     """Return the frames that every round repairs, by frame_id; never a held-out one.
 
-    ``which`` is ``all``; ``degraded``, those whose role is not ``strong``; or ``auto``, those in need by the
-    formations of the training before.
+    ``which`` is ``all``, or ``auto``: those in need by the formations of the training before.
     """
     frames = supervision.candidates
     if which == "auto":
         return frames_to_try(ranked_by_need(frames, formations))
-    return [frame.frame_id for frame in frames if which == "all" or frame.role != Role.STRONG]
+    return [frame.frame_id for frame in frames]
 
 
 def rows_of_others(

@@ -109,12 +109,6 @@ class Supervision:
         """The frames that may be repaired: all except the held-out ones."""
         return [frame for frame in self.assessments if frame.frame_id not in self.holdout_ids]
 
-    def worst(self, frame_ids: Sequence[int], count: int) -> list[TrainingView]:
-        """Return the ``count`` views of lowest R - B among ``frame_ids``, worst first."""
-        wanted = set(frame_ids)
-        ranked = sorted(self.assessments, key=lambda frame: (frame.R - frame.B, frame.frame_id))
-        return [self.views[frame.frame_id] for frame in ranked if frame.frame_id in wanted][:count]
-
 
 def load_supervision(ingest: Path, rva: Path, holdout_share: float) -> Supervision:
     """Read the finished folders of ingest and rva, without frames that RVA could not score. Decode no image.

@@ -28,7 +28,7 @@ _NOT_IN_KEY = Field(json_schema_extra={"key": False})
 
 
 class QwenConfig(Settings):
-    """Settings of the evaluator ``qwen3-vl``: a vision-language model on a server or in a local folder.
+    """Settings of the evaluator ``qwen3-vl``: a vision-language model on a server.
 
     The server's API key comes from the environment (CLEARGS_VLM_API_KEY) and is never written to a file.
     """
@@ -43,32 +43,14 @@ class QwenConfig(Settings):
         description="address of an OpenAI-compatible server (vLLM, llama.cpp, Ollama, LM Studio), including "
         "/v1; empty: from CLEARGS_VLM_URL in the environment, else http://127.0.0.1:8000/v1",
     )
-    model_dir: Annotated[str, _NOT_IN_KEY] = Field(
-        "", description="folder of a Qwen3-VL model to run locally (extra vlm) instead of on a server"
-    )
     prompt: ClassVar[int] = 1
     """Version of the prompt; part of the evaluator's name in the table."""
-    image_size: int = Field(
-        1024, ge=64, le=4096, description="px; larger images are reduced to this long side"
-    )
     max_tokens: int = Field(1024, ge=64, le=32_768, description="maximum length of a reply, in tokens")
-    local_threads: int = Field(
-        4, ge=1, le=256, description="CPU threads of a local model; its results depend on this number"
-    )
     concurrency: Annotated[int, _NOT_IN_KEY] = Field(
         4, ge=1, le=256, description="maximum number of requests at the same time"
     )
     timeout_s: Annotated[float, _NOT_IN_KEY] = Field(
         120.0, gt=0.0, le=3600.0, description="maximum wait for one reply"
-    )
-    attempts: Annotated[int, _NOT_IN_KEY] = Field(
-        5, ge=1, le=100, description="tries of one request if the server is busy, fails or does not answer"
-    )
-    backoff_s: Annotated[float, _NOT_IN_KEY] = Field(
-        1.0, ge=0.0, le=60.0, description="pause before the second try; doubled before each further try"
-    )
-    asks: Annotated[int, _NOT_IN_KEY] = Field(
-        3, ge=1, le=20, description="questions per frame if the replies do not match the schema"
     )
 
 
@@ -95,7 +77,7 @@ class EvaluatorConfig(FrozenModel):
         if not isinstance(data, Mapping) or data.get("evaluator") != "qwen3-vl":
             return data
         qwen = data.get("qwen", {})
-        if not isinstance(qwen, Mapping) or qwen.get("model") or qwen.get("model_dir"):
+        if not isinstance(qwen, Mapping) or qwen.get("model"):
             return data
         return {**data, "qwen": {**qwen, "model": os.environ.get(MODEL_VARIABLE, "").strip()}}
 
@@ -103,11 +85,8 @@ class EvaluatorConfig(FrozenModel):
     def _model_is_known(self) -> EvaluatorConfig:
         if self.qwen.base_url:
             check_base_url(self.qwen.base_url)
-        if self.evaluator == "qwen3-vl" and bool(self.qwen.model) == bool(self.qwen.model_dir):
-            raise ValueError(
-                "qwen3-vl needs either qwen.model (the name of a model on the server) or qwen.model_dir "
-                "(a model folder)"
-            )
+        if self.evaluator == "qwen3-vl" and not self.qwen.model:
+            raise ValueError(f"qwen3-vl needs qwen.model (or {MODEL_VARIABLE}), the model on the server")
         return self
 
 

@@ -20,8 +20,7 @@ Device = Literal["cpu", "cuda"]
 def check_evaluator(config: EvaluatorConfig) -> None:
     """Check that the evaluator of the settings is available. Load no weights.
 
-    Raises InputError if the plugin cannot be loaded, the server does not answer or lacks the model, or the
-    folder does not contain a Qwen3-VL model.
+    Raises InputError if the plugin cannot be loaded, or the server does not answer or lacks the model.
     """
     if config.evaluator == "qwen3-vl":
         _qwen(config.qwen).check()
@@ -34,8 +33,8 @@ def make_evaluator(
 ) -> Evaluator:
     """Create the evaluator of the settings.
 
-    ``seed`` is that of a model on a server or of a plugin, ``device`` that of a local model. ``cache`` is a
-    folder for results of single frames; None: no cache.
+    ``seed`` is that of a model on a server or of a plugin, ``device`` that of a plugin. ``cache`` is a folder
+    for results of single frames; None: no cache.
 
     Raises:
         InputError: The evaluator is unavailable, for example because the address of its server is invalid.
@@ -45,24 +44,18 @@ def make_evaluator(
 
         return StatisticsEvaluator(cache)
     if config.evaluator == "qwen3-vl":
-        return _qwen(config.qwen, seed, device, cache)
+        return _qwen(config.qwen, seed, cache)
     maker: Callable[..., Evaluator] = load_plugin("evaluators", config.evaluator)
     return maker(seed=seed, device=device, cache=cache)
 
 
-def _qwen(
-    config: QwenConfig, seed: int = 0, device: Device = "cpu", cache: Path | None = None
-) -> QwenEvaluator:
+def _qwen(config: QwenConfig, seed: int = 0, cache: Path | None = None) -> QwenEvaluator:
     """Create a Qwen3-VL evaluator. Raise InputError if the HTTP client of the server is not installed."""
-    if config.model_dir:
-        from cleargs.rva.vlm.local import QwenFolder  # loads torch
-
-        return QwenFolder(config, device=device, cache=cache)
     try:
-        from cleargs.rva.vlm.server import QwenServer
+        from cleargs.rva.vlm.evaluator import QwenEvaluator
     except ImportError as error:
         raise InputError(
             f"the HTTP client for qwen3-vl cannot be loaded: {error.msg}",
             hint="pip install 'cleargs[server]'",
         ) from error
-    return QwenServer(config, seed=seed, cache=cache)
+    return QwenEvaluator(config, seed=seed, cache=cache)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cleargs.base_model import Inherited, Settings, Unit
+from cleargs.base_model import Settings, Unit
 
 # Numbers of steps and Gaussians if the settings leave them unset (measured in docs/experiments/training.md).
 # Steps follow the number of frames, so that each frame is seen often enough. Gaussians follow the number of
@@ -94,8 +93,6 @@ class TrainConfig(Settings):
     constant four times. The noise on the means equals gsplat's at 3,200 steps. Source of these factors:
     docs/experiments/training.md.
     """
-
-    RETIRED: ClassVar[Mapping[str, Any]] = {"strategy": "mcmc", "adaptive": Inherited("g0", strictly=False)}
 
     quality: Quality = Field(
         "standard",

@@ -104,29 +104,21 @@ def _format(kind: str) -> Format:
     return found
 
 
-def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None:
-    """Raise InputError if the format ``kind`` does not support the up axis or the option."""
+def check_up(kind: str, up: str | None) -> None:
+    """Raise InputError if the format ``kind`` does not support the up axis."""
     if up not in (None, "y") and _format(kind).y_up:
         raise InputError(f"in .{kind} files y is always up", hint="give --up y, or omit --up")
-    if spz_version is not None and kind != "spz":
-        raise InputError(f"a .{kind} file has no SPZ version", hint="omit --spz-version")
 
 
-def write_scene(
-    path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: int | None = None
-) -> None:
+def write_scene(path: Path, scene: Scene, kind: str, *, turned: bool = False) -> None:
     """Write a scene atomically in the format ``kind``, as `format_of` returns it.
 
-    The scene is rotated to the axes of the file unless it is ``turned`` already. An SPZ file has version 3
-    unless ``spz_version`` is another one.
+    The scene is rotated to the axes of the file unless it is ``turned`` already.
     """
     target = _format(kind)
     if target.axes != _AS_IS and not turned:
         scene = transform_scene(scene, scale=1.0, rotation=np.diag(target.axes), translation=np.zeros(3))
-    if spz_version is not None:
-        write_bytes(path, spz(scene, spz_version))
-    else:
-        target.write(path, scene)
+    target.write(path, scene)
 
 
 def padded(scene: Scene, sh_degree: int) -> Scene:

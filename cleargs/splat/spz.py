@@ -1,9 +1,8 @@
 """``.spz``, the compressed splats of Niantic: columns of fixed-point numbers.
 
-Version 3 is one gzip stream. Version 4 has an uncompressed header, a table of sizes, and one zstd stream per
-column. The columns are the same: positions of 24 bits; opacities, colours and log scales of 8 bits; the three
-smaller components of the quaternions, of 10 bits (sign and 9 bits); and spherical harmonics of 8 bits for -1
-to 1. Source: nianticlabs/spz, ``load-spz.cc`` and "File Format" in the README.
+Version 3 of the format is one gzip stream: a header; positions of 24 bits; opacities, colours and log scales
+of 8 bits; the three smaller components of the quaternions, of 10 bits (sign and 9 bits); and spherical
+harmonics of 8 bits for -1 to 1. Source: nianticlabs/spz, ``load-spz.cc`` and "File Format" in the README.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import struct
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
@@ -21,17 +19,15 @@ from cleargs.errors import InputError
 from cleargs.splat.compressed_ply import smallest_three
 from cleargs.splat.scene import Scene
 
-_MAGIC = 0x5053474E
-_HEADER_BYTES = 32  # header of version 4, before the table of sizes
+_MAGIC, _VERSION = 0x5053474E, 3
 _ANTIALIASED = 1
 _COLOUR_SCALE = 0.15  # the 8 bits cover SH of degree 0 from -1/0.3 to 1/0.3
 _SH_STEPS = (8, 16)  # coefficients of degree 1 are rounded to 5 bits, higher ones to 4 (load-spz.cc)
 _FRACTION_BITS_MAX = 12  # for positions (load-spz.cc)
-_ZSTD_LEVEL = 12  # as in load-spz.cc
 
 
-def spz(scene: Scene, version: int = 3) -> bytes:
-    """Encode a scene in version 3, which most programs read, or 4; equal scenes give equal bytes.
+def spz(scene: Scene) -> bytes:
+    """Encode a scene in version 3 of the format, which most programs read; equal scenes give equal bytes.
 
     The scene has the axes of the format: x right, y up, z back. The format has no background. InputError is
     raised if the scene is too large for fixed-point positions.
@@ -48,7 +44,7 @@ def spz(scene: Scene, version: int = 3) -> bytes:
     # As many bits as the largest coordinate leaves of 24 bits with sign.
     fraction = int(np.clip(np.floor(23 - np.log2(max(reach, 1e-9)) - 1e-9), 0, _FRACTION_BITS_MAX))
     flags = _ANTIALIASED if scene.antialias else 0
-    header = struct.pack("<IIIBBB", _MAGIC, version, count, gaussians.sh_degree, fraction, flags)
+    header = struct.pack("<IIIBBBx", _MAGIC, _VERSION, count, gaussians.sh_degree, fraction, flags)
     steps = np.clip(np.rint(means * 2.0**fraction), -(2**23), 2**23 - 1).astype("<i4")
     positions = steps.view(np.uint8).reshape(count, 3, 4)[:, :, :3]
     alphas = _byte(torch.sigmoid(gaussians.logit_opacities).numpy() * 255.0)
@@ -58,16 +54,7 @@ def spz(scene: Scene, version: int = 3) -> bytes:
     columns: list[NDArray[Any]] = [positions, alphas, colours, scales, rotations]
     if coefficients > 1:
         columns.append(_harmonics(gaussians.sh.numpy()[:, 1:]))
-    contents = [column.tobytes() for column in columns]
-    if version == 3:
-        return gzip.compress(header + b"\0" + b"".join(contents), 9, mtime=0)
-    zstd = pa.Codec("zstd", compression_level=_ZSTD_LEVEL)
-    streams = [zstd.compress(content, asbytes=True) for content in contents]
-    sizes = [
-        struct.pack("<QQ", len(stream), len(content))
-        for stream, content in zip(streams, contents, strict=True)
-    ]
-    return b"".join([header, struct.pack("<BI12x", len(streams), _HEADER_BYTES), *sizes, *streams])
+    return gzip.compress(header + b"".join(column.tobytes() for column in columns), 9, mtime=0)
 
 
 def _byte(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import torch
 from torch import Tensor
 
-from cleargs.files import write_bytes
+from cleargs.media.image import write_rgb
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.types import Reading
 from cleargs.splat.views import TrainingView
@@ -89,6 +88,4 @@ class TrainLog:
 
 def write_preview(path: Path, image: Tensor) -> None:  # [H, W, 3] sRGB
     """Write ``image`` atomically as a PNG, its values clipped to [0, 1]."""
-    levels = (image.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()
-    _, data = cv2.imencode(".png", cv2.cvtColor(levels, cv2.COLOR_RGB2BGR))
-    write_bytes(path, data.tobytes())
+    write_rgb(path, image.cpu().numpy())

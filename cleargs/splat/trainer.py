@@ -20,6 +20,7 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
+from cleargs import kernel_cache
 from cleargs.errors import InputError, StageError
 from cleargs.progress import COMPILING, PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
@@ -174,7 +175,7 @@ class Trainer:
 
     def _warm_up(self, reporter: Reporter) -> None:
         """Compile the kernels before the first step, as a separate task if that takes long."""
-        compiled = compiled_mark(self._device.type)
+        compiled = compiled_mark(f"{self._device.type}-{kernel_cache.installation()}")
         if compiled.exists():
             self._backend.warm_up()
             return

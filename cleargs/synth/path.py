@@ -191,26 +191,18 @@ class StillHand:
 class HandheldPath:
     """Pose of the camera at any time of a walk along a course.
 
-    The walk takes ``seconds``: ``frames`` frames at `FPS` unless stated otherwise. For ``stretched`` see
-    `Hand`. With ``shots`` the camera stops for each of ``frames`` photographs, in a `StillHand`.
+    The walk has ``frames`` frames at `FPS`. For ``stretched`` see `Hand`. With ``shots`` the camera stops for
+    each of ``frames`` photographs, `SHOT_SECONDS` apart, in a `StillHand`.
     """
 
     def __init__(
-        self,
-        course: Course,
-        frames: int,
-        seed: int,
-        *,
-        seconds: float | None = None,
-        stretched: bool = False,
-        shots: bool = False,
+        self, course: Course, frames: int, seed: int, *, stretched: bool = False, shots: bool = False
     ) -> None:
-        self.duration = frames / FPS if seconds is None else seconds
+        self.duration = frames * SHOT_SECONDS if shots else frames / FPS
         """Duration in seconds."""
         self.hand = StillHand(seed) if shots else Hand(self.duration, seed, stretched=stretched)
         self._course = course
-        steps = frames if seconds is None else round(seconds * FPS)
-        self._pauses = frames if shots else max(1, round(steps / FRAMES_PER_PAUSE))
+        self._pauses = frames if shots else max(1, round(frames / FRAMES_PER_PAUSE))
         rng = np.random.default_rng([seed, Stream.WALK])
         self._phase = 0.0 if shots else rng.uniform(0, 2 * np.pi)  # phase of the pace, radians
 

@@ -19,7 +19,6 @@ from cleargs.media.image import write_rgb
 from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter, log_reporter
 from cleargs.random_streams import Stream
-from cleargs.synth.clip import write_clip
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
 from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, distorted, instant_shutter
 from cleargs.synth.path import FPS, SHOT_SECONDS, HandheldPath, SceneSetup, frame_times
@@ -85,8 +84,6 @@ def make_capture(
     reporter: Reporter | None = None,
     setup: SceneSetup | None = None,
     video: bool = False,
-    seconds: float | None = None,
-    fps: float | None = None,
 ) -> dict[str, Any]:
     """Write a capture into a new folder.
 
@@ -109,10 +106,6 @@ def make_capture(
         reporter: Receives the progress (default: the logger ``cleargs``).
         setup: World, course and lens for this number and size of frames; None: the room of ``seed``.
         video: Also write ``out/capture.mp4``, which the protocol phone always has.
-        seconds: Length of the walk. The frames are evenly spaced in it. None: `FPS` frames per second, or
-            one per `SHOT_SECONDS` for photographs.
-        fps: Frame rate of the video. It then has more frames than ``out/images``: see `cleargs.synth.clip`.
-            None: the frames of ``out/images``, at their rate.
 
     Returns:
         The contents of ``truth/capture.json``.
@@ -127,13 +120,10 @@ def make_capture(
     rules = find_protocol(protocol)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")
-    if video or fps is not None or rules.phone:
+    if video or rules.phone:
         require_even(width, height)
-    if rules.shots and seconds is None:
-        seconds = frames * SHOT_SECONDS
-    rate = FPS if seconds is None else frames / seconds
-    steps = frames if seconds is None or rules.shots else round(seconds * FPS)
-    setup = setup or room_setup(steps, width, height, seed, rules.moving)
+    rate = 1 / SHOT_SECONDS if rules.shots else FPS
+    setup = setup or room_setup(frames, width, height, seed, rules.moving)
     look = phone_look(seed) if rules.phone else PLAIN
     processing = {
         "tone_contrast": look.contrast,
@@ -143,9 +133,7 @@ def make_capture(
     }
     if not rules.phone:
         setup = replace(setup, film=None)
-    path = HandheldPath(
-        setup.course, frames, seed, seconds=seconds, stretched=rules.stretched, shots=rules.shots
-    )
+    path = HandheldPath(setup.course, frames, seed, stretched=rules.stretched, shots=rules.shots)
     times = frame_times(frames, rate)
     poses = path.poses(times)
     rng, count = np.random.default_rng([seed, Stream.NOVEL_POSES]), max(4, frames // 4)
@@ -188,11 +176,7 @@ def make_capture(
         for stem, pose in zip(novel_stems, novel, strict=True):
             _write_sharp(out / "truth" / "novel", stem, setup, pose, look)
             task.advance()
-    if fps is not None:
-        write_clip(
-            out / "capture.mp4", setup, rules, path, faults, look=look, fps=fps, seed=seed, reporter=reporter
-        )
-    elif video and not rules.phone:
+    if video and not rules.phone:
         write_video(out / "capture.mp4", shots, rate)
     write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), FRAMES)
     for kind, names, exact in (("observed", stems, poses), ("novel", novel_stems, novel)):
@@ -208,7 +192,7 @@ def make_capture(
         "width": width,
         "height": height,
         "fps": rate,
-        "video_fps": fps or (rate if video or rules.phone else None),
+        "video_fps": rate if video or rules.phone else None,
         "jpeg_quality": rules.jpeg,
         "codec_bits_per_pixel": processing["codec_bits_per_pixel"],
         "moving": setup.film is not None,

@@ -13,13 +13,15 @@ from benchmarks.commands import invoke
 from benchmarks.comparison import results_page as results
 from benchmarks.comparison.cells import Cell
 from benchmarks.comparison.evidence import EvidenceContext, estimate_minutes, read_evidence
+from benchmarks.comparison.front_page import FAULTS, fault_rows, fault_table, plot_gains, with_block
 from benchmarks.comparison.origin import version_of_source
-from benchmarks.comparison.results_page import Origin, losses, results_page
+from benchmarks.comparison.results_page import Origin, losses, section_page, summary_page
 from benchmarks.comparison.saved_sections import SavedSection
 from benchmarks.comparison.scenes import Sample, SceneRecipe
 from benchmarks.comparison.variants import QUESTIONS, VARIANTS, find_variants
-from cleargs.errors import ConfigError
+from cleargs.errors import ConfigError, InputError
 from cleargs.evaluate.config import EvalOptions
+from cleargs.media.image import read_rgb
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import opened_store
 from cleargs.progress import SilentReporter
@@ -194,7 +196,7 @@ def test_scenes_shared_by_sections_count_once() -> None:
     whole, part, other = found(-1.0, -1.1, -0.9), found(-1.0), found(-2.0)
     assert len(losses([whole, whole, part])) == 1
     assert len(losses([whole, other])) == 2
-    page = results_page([whole, part], ORIGIN)
+    page = summary_page([whole, part], ORIGIN)
     assert "Worse in 1 of 2 comparisons, significantly in 1 of them." in page
     assert "| the whole method, against all-view training | 0 / 1 / 0 | not made |" in page
 
@@ -206,41 +208,82 @@ def test_aligned_sections_do_not_count() -> None:
 
 
 def test_page_of_a_few_cells() -> None:
-    page = results_page([found(-1.0, -1.1, -0.9)], ORIGIN)
+    saved = found(-1.0, -1.1, -0.9)
+    page, own = summary_page([saved], ORIGIN), section_page(saved, ORIGIN)
     assert "Worse in 1 of 2 comparisons, significantly in 1 of them." in page
     row = "| Motion blur | mixed | At the input's true poses | all-view G0 | **-1.00 ± 0.25** |  |  |  |"
     assert row in page
-    assert page.index(row) < page.index("## In short") < page.index("## Motion blur")
+    assert page.index(row) < page.index("## In short")
+    assert "| [Motion blur](blur.md) | mixed | 600 | 0.1.0, abc |" in page
     assert (
         "| the whole method, against all-view training | 0 / 1 / 0 | not made | not made | 1 / 0 / 0 |"
         in page
     )
-    assert "* phone: no protocol is called 'phone'" in page
+    assert "* phone: no protocol is called 'phone'" in own and "Made by version 0.1.0, abc." in own
     assert "`python -m benchmarks evidence -o OUT --section blur`, version 0.1.0, abc" in page
+    assert "`python -m benchmarks evidence -o OUT --section blur`, version 0.1.0, abc" in own
     assert "LPIPS (AlexNet) could not be measured" in page
-    assert "| mixed (n = 3) |" in page
+    assert own.startswith("# Motion blur\n") and "| mixed (n = 3) |" in own
+    assert "older list" not in page + own
     assert "@" not in page, "all placeholders of the template are filled"
 
 
 def test_page_shows_a_section_without_results() -> None:
     nothing = found().model_copy(update={"missing": ("kitchen: it is not there",)})
-    page = results_page([nothing], ORIGIN)
+    page = section_page(nothing, ORIGIN)
     assert "* kitchen: it is not there" in page and "No result of this section could be made" in page
 
 
 def test_page_names_its_sections_and_versions() -> None:
     other = read_evidence().quick[1]
     pair = [found(1.0), found(2.0, version="0.2.0, def").model_copy(update={"section": other})]
-    page = results_page(pair, ORIGIN)
+    page = summary_page(pair, ORIGIN)
     absent = [section.title for section in ORIGIN.sections if section not in (pair[0].section, other)]
     assert f"**Not made yet: {', '.join(absent)}.**" in page
     command = "`python -m benchmarks evidence -o OUT --section blur --section mixed`"
     command += ", version 0.1.0, abc and 0.2.0, def"
     assert page.count(command) == 2, "under the losses and under the answers"
-    assert "`python -m benchmarks evidence -o OUT --section mixed`, version 0.2.0, def" in page
+    own = "`python -m benchmarks evidence -o OUT --section mixed`, version 0.2.0, def"
+    assert own in section_page(pair[1], ORIGIN)
     alone = replace(ORIGIN, sections=(pair[0].section, other))
-    whole = results_page(pair, alone)
+    whole = summary_page(pair, alone)
     assert "Not made yet" not in whole and "`python -m benchmarks evidence -o OUT`, version 0.1.0" in whole
+
+
+def test_section_of_an_older_list_is_named() -> None:
+    saved = found(1.0)
+    older = saved.model_copy(update={"section": saved.section.model_copy(update={"steps": 999})})
+    assert "older list of captures" in section_page(older, ORIGIN)
+    assert "0.1.0, abc (older list)" in summary_page([older], ORIGIN)
+
+
+def test_front_page_names_faults_in_words(tmp_path: Path) -> None:
+    saved = found(2.0, 2.1, 1.9)
+    section = saved.section.model_copy(update={"name": "default-length"})
+    cells = tuple(
+        one.model_copy(update={"means": one.means | {"lpips_alex": one.means["lpips_vgg"]}})
+        for one in saved.cells
+    )
+    saved = saved.model_copy(update={"section": section, "cells": cells})
+    table = fault_table([saved])
+    assert f"| {FAULTS['mixed']} | 21.0 / 0.400 | 23.0 / 0.301 | **+2.0 ± 0.2** |" in table
+    assert "Version 0.1.0, abc." in table and "| mixed |" not in table
+    assert fault_table([found(2.0)]) == "", "other sections are on their own pages only"
+    plot_gains(tmp_path / "gains.png", fault_rows([saved]))
+    assert read_rgb(tmp_path / "gains.png").std() > 10
+
+
+def test_faults_have_words_for_every_protocol_of_the_test_set() -> None:
+    assert set(read_evidence().test.protocols) == FAULTS.keys()
+
+
+def test_table_goes_between_its_lines() -> None:
+    page = "# Title\n\n<!-- faults -->\nold\n<!-- /faults -->\n\nrest\n"
+    new = with_block(page, "faults", "| a |")
+    assert new == "# Title\n\n<!-- faults -->\n\n| a |\n\n<!-- /faults -->\n\nrest\n"
+    assert with_block(new, "faults", "| a |") == new
+    with pytest.raises(InputError, match="no place"):
+        with_block(page, "real", "| a |")
 
 
 def test_version_contains_a_digest_of_the_source() -> None:
@@ -261,13 +304,13 @@ def test_tiny_page_is_made_and_resumed(tmp_path: Path, capsys: pytest.CaptureFix
     # An interrupted call leaves a capture under a temporary name, which does not count as complete.
     (out / "captures" / ".1-mixed-6x96x54-100" / "images").mkdir(parents=True)
     assert make(out, spec) == 3, "partial: a protocol and a video are missing"
-    page = (out / "results.md").read_bytes()
-    text = page.decode()
-    assert "* flood: no protocol is called 'flood'" in text
-    assert "* kitchen: this real capture needs --captures" in text
-    assert "| mixed 1x | mixed 2x |" in text
-    assert "| all-view G0 | 24 to 48 |" in text and "| ClearGS | 24 to 48 |" in text
-    assert text.count("colours of each image fitted to the truth (affine in sRGB) before measuring.") == 1
+    pages = read_pages(out)
+    assert pages.keys() == {"all.md", "rooms.md", "aligned.md", "videos.md"}
+    assert "* flood: no protocol is called 'flood'" in pages["rooms.md"]
+    assert "* kitchen: this real capture needs --captures" in pages["videos.md"]
+    assert "| mixed 1x | mixed 2x |" in pages["rooms.md"]
+    assert "| all-view G0 | 24 to 48 |" in pages["rooms.md"] and "| ClearGS | 24 to 48 |" in pages["rooms.md"]
+    assert "fitted to the truth (affine in sRGB) before measuring." in pages["aligned.md"]
     plain, aligned = (
         SavedSection.model_validate_json((out / f"results/{name}.json").read_bytes())
         for name in ("rooms", "aligned")
@@ -282,20 +325,24 @@ def test_tiny_page_is_made_and_resumed(tmp_path: Path, capsys: pytest.CaptureFix
     stored = {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
     assert make(out, spec) == 3
     assert stored == {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
-    assert (out / "results.md").read_bytes() == page
+    assert read_pages(out) == pages
 
-    # A call for one section reads the others from results/, except those of another list.
-    (out / "results.md").unlink()
-    assert make(out, spec, "--section", "videos") == 3
-    assert (out / "results.md").read_bytes() == page
+    # A call for one section, or for none, writes the others from results/.
+    for more, code in (("--section", "videos"), 3), (("--rewrite",), 0):
+        for path in (out / "results").glob("*.md"):
+            path.unlink()
+        assert make(out, spec, *more) == code
+        assert read_pages(out) == pages
     spec.write_text(TINY.replace("steps = 24", "steps = 25", 1))
     capsys.readouterr()
-    assert make(out, spec, "--section", "videos") == 3
-    assert (
-        "rooms.json was made from another list: the page does not include 'Motion blur'"
-        in capsys.readouterr().err
-    )
-    assert "**Not made yet: Motion blur.**" in (out / "results.md").read_text()
+    assert make(out, spec, "--rewrite") == 0
+    assert "rooms.json was made from another list of evidence" in capsys.readouterr().err
+    assert "(older list)" in read_pages(out)["all.md"]
+
+
+def read_pages(out: Path) -> dict[str, str]:
+    """Return the pages in ``results/`` by name."""
+    return {path.name: path.read_text() for path in (out / "results").glob("*.md")}
 
 
 def test_list_that_is_a_pipe_or_too_deep_is_refused(tmp_path: Path) -> None:

@@ -7,18 +7,21 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.commands import invoke
 from benchmarks.comparison import real
 from benchmarks.comparison.cells import Cell
 from benchmarks.comparison.findings import Comparison
 from benchmarks.comparison.real import (
+    RealResults,
     RealScene,
     find_scenes,
     read_real_list,
+    read_results,
     real_table,
     run_scenes,
     showcase,
-    table_of,
-    with_table,
+    summary_table,
+    with_tables,
 )
 from benchmarks.comparison.scenes import SceneRecipe
 from cleargs.errors import InputError
@@ -63,9 +66,20 @@ def test_the_list_has_valid_settings_and_names_its_sources() -> None:
         find_scenes(listed, ["kitchn"])
 
 
+def results() -> RealResults:
+    """Two trainings of blurball, and a scene that could not be made."""
+    cells = [
+        cell(name, seed, 29.0 + 2 * seed - (name == "all-view"))
+        for name in ("all-view", "full")
+        for seed in (0, 1)
+    ]
+    return RealResults().with_scenes(
+        Comparison(cells=cells, failures=["fox: it is missing"]), "0.2.0, abc, source 0123", 2
+    )
+
+
 def test_the_table_has_means_over_seeds_and_published_figures() -> None:
-    found = Comparison(cells=[cell("full", 0, 29.0), cell("full", 1, 31.0)], failures=["fox: it is missing"])
-    table = real_table(read_real_list(), found)
+    table = real_table(read_real_list(), results())
     assert (
         "| blurball | ClearGS | 30.00 ± 1.41 | 30.50 ± 1.41 | 0.800 ± 0.000 | 0.200 ± 0.000 | 2.0 |" in table
     )
@@ -75,13 +89,49 @@ def test_the_table_has_means_over_seeds_and_published_figures() -> None:
     assert "Not made: fox: it is missing." in table and "blurball: Deblur-NeRF's real scene" in table
 
 
-def test_the_table_goes_between_its_lines_and_is_found_there() -> None:
-    page = "# Title\n\n<!-- real -->\nold\n<!-- /real -->\n\nrest\n"
-    new = with_table(page, "| a |")
-    assert new == "# Title\n\n<!-- real -->\n\n| a |\n\n<!-- /real -->\n\nrest\n"
-    assert table_of(new) == "| a |" and with_table(new, "| a |") == new
+def test_the_short_table_has_a_row_per_scene() -> None:
+    table = summary_table(read_real_list(), results())
+    (row,) = [line for line in table.splitlines() if line.startswith("| blurball")]
+    assert row.endswith("| 29.00 / 0.200 (29.50) | 30.00 / 0.200 (30.50) | 2.0 and 2.0 |")
+    assert "| *Deblur-NeRF, 200,000 iterations, on blurball* |  | *27.33 / 0.223* |  |" in table
+    assert "Version blurball 0.2.0, abc (mean of 2 trainings)." in table and "CoMoGaussian" not in table
+    assert "Still to be measured: kitchen, office, fox, bonsai." in table
+
+
+def test_scenes_of_an_earlier_call_stay_with_their_version(tmp_path: Path) -> None:
+    fox = cell("full", 0, 25.0).model_copy(update={"column": "fox"})
+    both = results().with_scenes(Comparison(cells=[fox]), "0.3.0, def", 1)
+    assert both.scenes.keys() == {"blurball", "fox"} and both.failures == ()
+    (tmp_path / "real.json").write_text(both.model_dump_json())
+    assert read_results(tmp_path / "real.json") == both
+    table = real_table(read_real_list(), both)
+    assert "version 0.2.0, abc" in table and "version 0.3.0, def" in table
+    assert "| fox: phone video of an exhibit, mostly sharp | - | 25.00" in summary_table(
+        read_real_list(), both
+    )
+    assert read_results(tmp_path / "absent.json") == RealResults()
+
+
+def test_a_page_gets_the_tables_that_it_has_places_for() -> None:
+    listed, found = read_real_list(), results()
+    short, full = "<!-- real -->\nold\n<!-- /real -->\n", "<!-- real-full -->\n<!-- /real-full -->\n"
+    assert summary_table(listed, found) in (page := with_tables(short, listed, found)) and "old" not in page
+    both = with_tables(short + full, listed, found)
+    assert summary_table(listed, found) in both and real_table(listed, found) in both
+    assert real_table(listed, found) in with_tables(full, listed, found)
     with pytest.raises(InputError, match="no place"):
-        with_table("# Title\n", "| a |")
+        with_tables("# Title\n", listed, found)
+
+
+def test_pages_are_written_again_without_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("<!-- real -->\n<!-- /real -->\n")
+    (tmp_path / "real.json").write_text(results().model_dump_json())
+    assert invoke(["real", "-o", str(tmp_path), "--rewrite", "--page", str(page)]) == 3, "fox is missing"
+    assert summary_table(read_real_list(), results()) in page.read_text()
+    assert invoke(["real", "-o", str(tmp_path / "empty"), "--rewrite", "--page", str(page)]) == 2
+    assert "has no results" in capsys.readouterr().err
+    assert invoke(["real", "-o", str(tmp_path)]) == 2 and "--captures" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # two tiny trainings and their evaluations
@@ -95,8 +145,8 @@ def test_a_tiny_benchmark_is_resumed_and_names_what_is_missing(
     shutil.rmtree(captures / "room" / "truth")  # a real capture has none
     monkeypatch.setattr(real, "SHOWN", "000001")
     scenes = [
-        RealScene(name=real.SHOWCASE, capture="room", settings=SETTINGS, protocol="a room"),
-        RealScene(name="fox", capture="fox", settings=SETTINGS, protocol="absent"),
+        RealScene(name=real.SHOWCASE, shows="a room", capture="room", settings=SETTINGS, protocol="a room"),
+        RealScene(name="fox", shows="a fox", capture="fox", settings=SETTINGS, protocol="absent"),
     ]
     recipe = SceneRecipe(installed(), "default", (), "cpu", 1, EvalOptions(lpips=(), scorers=()), 24)
     with opened_store(out / ".store") as store:

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from cleargs.cli.show import frame_rows, labelled, reason, short_name
+from cleargs.cli.frame_rows import frame_rows, reason, short_name
+from cleargs.cli.show import labelled
 from cleargs.report.frames import worst_cue
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.stages.rva import RvaConfig

@@ -42,15 +42,6 @@ def test_onnxruntime_is_named_with_distribution_and_device(
     assert runtime_version("cpu") == "absent, on cpu"
 
 
-def test_a_library_counts_only_where_it_is_used() -> None:
-    """Once, installing transformers for the tests made every run's RVA out of date."""
-    stage = installed().load("rva")
-    usual = stage.CONFIG()
-    local = stage.CONFIG(evaluator="qwen3-vl", qwen={"model_dir": "/models/qwen"})
-    assert not {"torch", "transformers"} & set(library_versions(stage, "cpu", usual))
-    assert {"torch", "transformers"} <= set(library_versions(stage, "cpu", local))
-
-
 @pytest.mark.parametrize("name", ["g0", "rivr", "consolidate"])
 def test_triton_counts_on_a_gpu_only(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(onnx, "network_device", lambda device, warn: "cpu")

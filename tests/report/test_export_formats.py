@@ -197,7 +197,6 @@ def test_up(run: FinishedRun, kind: str, tmp_path: Path) -> None:
     [
         ("a.ply", ("--up", "z", "--world", "input"), "--up"),
         ("a.glb", ("--up", "z"), "y is always up"),
-        ("a.ply", ("--spz-version", "4"), "no SPZ version"),
         ("a.ply", ("--prune", "opacity"), "--prune opacity"),
         ("a.ply", ("--prune", "size:1"), "--prune size:1"),
         ("a.ply", ("--prune", "opacity:0.1", "--prune", "opacity:0.2"), "--prune opacity:0.2"),
@@ -219,10 +218,3 @@ def test_what_cannot_be_meant_is_refused(
     assert export(run, tmp_path / name, *options) == 2 and not list(tmp_path.iterdir())
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("error", "hint"))]
     assert len(said) == 2 and cause in said[0]
-
-
-def test_both_versions_of_spz(run: FinishedRun, tmp_path: Path) -> None:
-    for version in ("3", "4"):
-        assert export(run, tmp_path / f"{version}.spz", "--spz-version", version) == 0
-    assert (tmp_path / "3.spz").read_bytes()[:2] == b"\x1f\x8b"  # gzip
-    assert (tmp_path / "4.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"

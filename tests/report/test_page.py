@@ -26,14 +26,15 @@ from cleargs.manifest import Manifest, linked_manifest, write_manifest
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
 from cleargs.report.advice import command
-from cleargs.report.frames import FramePictures, FrameRow, ImageFile, layers_of, load_rows
+from cleargs.report.frames import FrameRow, load_rows
 from cleargs.report.page import (
     changed_settings,
     frame_data,
     json_in_html,
     write_report,
 )
-from cleargs.report.report_json import LastRun, cameras_of, is_current, linked_manifests
+from cleargs.report.pictures import FramePictures, ImageFile, layers_of
+from cleargs.report.report_json import cameras_of, is_current, linked_manifests
 from cleargs.report.single_file import single_file_size, write_single_file
 from cleargs.report.web_scene import SCENE_BYTES, shown_degree, write_scene
 from cleargs.rivr.tables import Selection
@@ -81,7 +82,7 @@ def store(run: FinishedRun) -> Iterator[Store]:
 
 @pytest.fixture(scope="module")
 def page(run: FinishedRun, store: Store) -> Path:
-    return write_report(run.planner(store), LastRun({"ingest": "found", "g0": "made"}, 1.25))
+    return write_report(run.planner(store))
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +146,7 @@ def test_a_report_knows_whether_it_is_current(run: FinishedRun, store: Store, pa
     assert is_current(run.folder, manifests)
     other = manifests["g0"].model_copy(update={"key": "0" * 64})
     assert not is_current(run.folder, {**manifests, "g0": other})
-    again = write_report(run.planner(store))  # keeps the record of the last run
-    text = Page(again.read_text()).text
-    assert "Peak memory of the last run: 1.2 GB." in text and "computed in the last run" in text
+    assert "Total time:" in page.read_text()
     assert not [path for path in run.folder.iterdir() if "partial" in path.name]
 
 
@@ -161,16 +160,32 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         planner = run.planner(Store(tmp_path, memo))
         page = write_run_report(planner, outcomes("found"))
-        assert page == run.folder / "report/index.html" and "reused in the last run" in page.read_text()
+        assert page == run.folder / "report/index.html"
         page.write_text("as it was")
         assert write_run_report(planner, outcomes("found")) == page and page.read_text() == "as it was"
         assert write_run_report(planner, outcomes("made")) == page
-        assert "computed in the last run" in page.read_text()
+        whole = page.read_text()
+        assert whole != "as it was"
         (run.folder / "consolidate/scene.ply").write_bytes(b"damaged")
         assert write_run_report(planner, outcomes("made")) is None  # the run itself has succeeded
-        assert "computed in the last run" in page.read_text()  # the report before stays
+        assert page.read_text() == whole, "the report before stays"
         (run.folder / "ingest/manifest.json").unlink()
         assert write_run_report(planner, outcomes("found")) is None  # there is nothing to report on
+
+
+def test_commands_start_with_the_program_as_the_user_called_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = FinishedRun(tmp_path)
+    monkeypatch.setenv("CLEARGS_PROGRAM", f"{tmp_path}/.venv/bin/cleargs")
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+    commands = re.findall(r'data-copy="([^"]+)"', text)
+    assert len(commands) >= 4 and all(one.startswith(".venv/bin/cleargs r") for one in commands)
+    assert ".venv/bin/cleargs report run --single-file" in (run.folder / "report.html").read_text()
+    write_single_file(run.folder / "report/index.html", tmp_path / "one.html")
+    shared = re.findall(r'data-copy="([^"]+)"', (tmp_path / "one.html").read_text())
+    assert len(shared) == len(commands) and all(one.startswith("cleargs r") for one in shared)
 
 
 def test_an_older_report_gets_a_note(tmp_path: Path) -> None:
@@ -305,6 +320,9 @@ def test_the_command_writes_one_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert invoke(["report", str(run), "-q", "--single-file"]) == 0
     file = run / "run-report.html"
     assert f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)" in capsys.readouterr().out
+    (run / "report.html").unlink()
+    assert invoke(["report", str(run), "-q"]) == 0
+    assert capsys.readouterr().out == f"report: {(run / 'report.html').as_uri()}\n"
     assert (run / "report.html").is_file()
     assert invoke(["report", str(run), "--single-file", "--json", "-o", str(tmp_path / "a.html")]) == 0
     facts = json.loads(capsys.readouterr().out)

@@ -18,6 +18,7 @@ import torch
 from report_run import FinishedRun, camera, wall
 from watched import reported, serving, working
 
+from cleargs.cli.main import invoke
 from cleargs.errors import InputError
 from cleargs.progress import PREVIEW
 from cleargs.report.serve import Server
@@ -212,6 +213,16 @@ def test_the_address_is_local_and_errors_are_reported(finished: FinishedRun) -> 
             Server(finished.dag, finished.run, "127.0.0.1", int(server.server_address[1]))
     with pytest.raises(InputError, match="cannot serve at"):
         Server(finished.dag, finished.run, "no such host", 0)
+
+
+def test_open_shows_the_page_in_the_browser(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("click.launch", opened.append)
+    monkeypatch.setattr(Server, "serve_forever", lambda server: None)
+    assert invoke(["watch", str(finished.folder), "--open"]) == 0
+    assert invoke(["report", str(finished.folder), "--open", "-q"]) == 0
+    served, written = opened
+    assert served.startswith("http://127.0.0.1:") and written == (finished.folder / "report.html").as_uri()
 
 
 def test_ctrl_c_ends_it_without_a_word(finished: FinishedRun) -> None:

@@ -143,13 +143,6 @@ def test_later_rounds_render_the_distilled_scene(capture: Capture) -> None:
     assert (first["render"] != second["render"]).any()
 
 
-def test_degraded_targets_only(capture: Capture) -> None:
-    context = capture.context("rivr", tiny_rivr(targets="degraded", rounds=1))
-    rivr.run(context)
-    rows = tried_rows(context)
-    assert [row.frame_id for row in rows] == [k for k in TARGETS if ROLES[k] != "strong"]
-
-
 def test_without_the_observation_the_expert_restores_the_render(capture: Capture, expert: Sharpen) -> None:
     context = capture.context("rivr", tiny_rivr(use_observation=False))
     rivr.run(context)

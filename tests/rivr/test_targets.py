@@ -35,10 +35,6 @@ def test_all_takes_every_frame_but_the_held_back() -> None:
     assert frames_to_repair("all", supervision(), {}) == [10, 11, 12, 14, 15]
 
 
-def test_degraded_leaves_the_strong_ones_out() -> None:
-    assert frames_to_repair("degraded", supervision(), {}) == [11, 12, 14, 15]
-
-
 def found(**misfits: float) -> dict[int, FrameFormation]:
     """Formations of frames ``f10``, ``f11``, ... with these misfits, of which none has a model."""
     return {int(name[1:]): FrameFormation(int(name[1:]), misfit=misfit) for name, misfit in misfits.items()}

@@ -61,7 +61,14 @@ class Bench:
             (root / name).mkdir()
 
     def run(self, url: str, **settings: Any) -> tuple[StageResult, Rows]:
-        qwen = {"model": MODEL, "base_url": url, "timeout_s": 10, "backoff_s": 0, **settings}
+        """Run with these settings of qwen3-vl. Names in capitals are constants of its modules."""
+        with pytest.MonkeyPatch.context() as constants:
+            for name in [name for name in settings if name.isupper()]:
+                module = "evaluator" if name == "LONG_SIDE" else "server"
+                constants.setattr(f"cleargs.rva.vlm.{module}._{name}", settings.pop(name))
+            return self._run({"model": MODEL, "base_url": url, "timeout_s": 10, **settings})
+
+    def _run(self, qwen: dict[str, Any]) -> tuple[StageResult, Rows]:
         context = StageContext(
             config=RvaConfig.model_validate({"evaluator": "qwen3-vl", "qwen": qwen}),
             source=self.root,
@@ -88,6 +95,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     for name in ("CLEARGS_VLM_URL", "CLEARGS_VLM_MODEL", "http_proxy", "HTTP_PROXY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("CLEARGS_VLM_API_KEY", KEY)
+    monkeypatch.setattr("cleargs.rva.vlm.server._PAUSE_S", 0.0)
     return Bench(tmp_path)
 
 
@@ -107,7 +115,7 @@ def first(answer: Answer) -> Callable[[Request, int], Answer]:
 
 def test_a_server_that_answers_well(bench: Bench) -> None:
     with vlm_server() as log:
-        result, rows = bench.run(log.url, image_size=64)
+        result, rows = bench.run(log.url, LONG_SIDE=64)
     assert_complete(result, rows)
     assert {row["evaluator"] for row in rows.values()} == {f"qwen3-vl:{MODEL}:prompt-1"}
     assert rows[0]["role"] == "strong" and rows[5]["R"] == pytest.approx(0.2)
@@ -146,7 +154,7 @@ def test_no_more_requests_at_once_than_allowed(bench: Bench) -> None:
 )
 def test_transient_errors_are_tried_again(bench: Bench, answer: Answer) -> None:
     with vlm_server(first(answer)) as log:
-        assert_complete(*bench.run(log.url, timeout_s=0.6, concurrency=FRAMES, attempts=10))
+        assert_complete(*bench.run(log.url, timeout_s=0.6, concurrency=FRAMES, ATTEMPTS=10))
     # On a busy machine a good answer may also be late.
     assert all(log.frames().count(frame) >= 2 for frame in range(FRAMES))
 
@@ -170,7 +178,7 @@ def test_the_server_says_how_long_to_wait(bench: Bench, monkeypatch: pytest.Monk
         return Answer(status=429, headers={"Retry-After": header} if header else {}, body=b"")
 
     with vlm_server(script) as log:
-        assert_complete(*bench.run(log.url, backoff_s=1.0, concurrency=1))
+        assert_complete(*bench.run(log.url, PAUSE_S=1.0, concurrency=1))
     # Seconds; a date in an hour, limited to two minutes; then the doubled back-off of the next tries.
     assert pauses == [7.0, 120.0, 4.0, 8.0]
 
@@ -225,7 +233,7 @@ def test_an_unscored_frame_is_marked_and_tried_again_later(bench: Bench, tmp_pat
         return Answer(status=500, body=b"") if request.frame == 4 else answer_truth(request, before)
 
     with vlm_server(stubborn) as log:
-        result, rows = bench.run(log.url, asks=2, attempts=3)
+        result, rows = bench.run(log.url, ASKS=2, ATTEMPTS=3)
     assert result.missing == ("frame 2 (2.jpg) was not scored", "frame 4 (4.jpg) was not scored")
     assert log.frames() == [0, 1, 2, 2, 3, 4, 4, 4, 5]
     for k in (2, 4):
@@ -250,7 +258,7 @@ def test_an_unscored_frame_is_marked_and_tried_again_later(bench: Bench, tmp_pat
 def test_a_server_that_dies_half_way(bench: Bench) -> None:
     """The server stops after the second frame. The next call, with a new server, asks for the others."""
     with vlm_server(dies_with=2) as log:
-        result, rows = bench.run(log.url, attempts=3, concurrency=1)
+        result, rows = bench.run(log.url, ATTEMPTS=3, concurrency=1)
     assert len(result.missing) == FRAMES - 2
     assert [k for k, row in rows.items() if row["r_sharpness"] is not None] == [0, 1]
     reasons = [warning for warning in bench.remarks.warnings if "was not scored" in warning]
@@ -266,7 +274,7 @@ def test_a_stage_without_any_score_fails(bench: Bench) -> None:
         place.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{place.getsockname()[1]}/v1"
     with pytest.raises(StageError, match="scored no frame: no server answers"):
-        bench.run(url, attempts=1)
+        bench.run(url, ATTEMPTS=1)
     assert not list((bench.root / "out").iterdir())
 
 
@@ -282,7 +290,7 @@ def test_a_damaged_cache_file_is_replaced(bench: Bench) -> None:
 
 def test_cached_scores_are_for_the_same_question_only(bench: Bench) -> None:
     with vlm_server() as log:
-        for settings in ({}, {"model": "other"}, {"image_size": 64}, {"concurrency": 1}):
+        for settings in ({}, {"model": "other"}, {"max_tokens": 64}, {"concurrency": 1}):
             bench.run(log.url, **settings)
     assert len(log.requests) == 3 * FRAMES
 
@@ -332,7 +340,7 @@ def test_the_key_is_not_sent_to_another_host(bench: Bench) -> None:
 
 
 def test_without_the_client(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("httpx2", "cleargs.rva.vlm.server"):
+    for name in ("httpx2", "cleargs.rva.vlm.server", "cleargs.rva.vlm.evaluator"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.setitem(sys.modules, "httpx2", None)
     with pytest.raises(InputError, match="httpx2") as caught:
@@ -382,8 +390,9 @@ def test_from_the_command_line(
 
     def run() -> int:
         given = ["run", str(tmp_path / "source"), "-o", str(folder), "--workflow", str(recipe)]
-        given += ["--set", "rva.evaluator=qwen3-vl", "--set", "rva.qwen.backoff_s=0"]
-        return invoke([*given, "--set", "rva.qwen.attempts=1", "--debug"], two_stages())
+        given += ["--set", "rva.evaluator=qwen3-vl", "--debug"]
+        monkeypatch.setattr("cleargs.rva.vlm.server._ATTEMPTS", 1)
+        return invoke(given, two_stages())
 
     def failing(request: Request, before: int) -> Answer:
         body = f"no: {request.headers['Authorization']}".encode()
@@ -413,9 +422,8 @@ def test_from_the_command_line(
 
 def test_the_model_must_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CLEARGS_VLM_MODEL", raising=False)
-    for qwen in ({}, {"model": "a", "model_dir": "b"}):
-        with pytest.raises(ValueError, match=r"either qwen\.model"):
-            RvaConfig.model_validate({"evaluator": "qwen3-vl", "qwen": qwen})
+    with pytest.raises(ValueError, match=r"needs qwen\.model"):
+        RvaConfig.model_validate({"evaluator": "qwen3-vl", "qwen": {}})
     assert RvaConfig.model_validate({"qwen": {}}).qwen.model == ""
 
 

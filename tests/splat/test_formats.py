@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -95,22 +93,6 @@ def test_spz_read_by_gsply(sh_degree: int, tmp_path: Path) -> None:
     write_scene(tmp_path / "a.spz", made, "spz")
     found = gaussians(read_spz(tmp_path / "a.spz"))
     assert_turned(found, made.gaussians, ABOUT_X, sh_within=0.06)  # 4 bits for the higher degrees
-
-
-@pytest.mark.parametrize("sh_degree", [0, 3])
-def test_spz_versions_have_the_same_columns(sh_degree: int) -> None:
-    """Version 4 has an uncompressed header, a table of sizes, and a zstd stream per column."""
-    made = scene(sh_degree)
-    old, new = gzip.decompress(spz(made, 3)), spz(made, 4)
-    assert new[:15] == old[:4] + b"\x04\0\0\0" + old[8:15]
-    count, table = struct.unpack_from("<BI", new, 15)
-    assert (count, table, new[20:32]) == (6 if sh_degree else 5, 32, bytes(12))
-    at, columns = table + 16 * count, []
-    for index in range(count):
-        packed, size = struct.unpack_from("<QQ", new, table + 16 * index)
-        columns.append(pa.decompress(new[at : at + packed], size, codec="zstd", asbytes=True))
-        at += packed
-    assert at == len(new) and b"".join(columns) == old[16:]
 
 
 @pytest.mark.parametrize("sh_degree", [0, 2])

@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812  # torch's own name for it
 from helpers.losses import adam_step, photometric_loss
 
-from cleargs.errors import InputError
 from cleargs.formation.exposure import affine_backward, apply_affine
 from cleargs.splat.backend import psnr
 
@@ -133,12 +132,9 @@ def test_psnr():
 
 def test_psnr_refuses_images_that_do_not_match():
     image, target, _ = images(8, 9)
-    with pytest.raises(InputError, match="compared"):
-        psnr(image, target[:5])
-    with pytest.raises(InputError, match="float64"):
-        psnr(image.double(), target)
-    with pytest.raises(InputError, match="mask"):
-        psnr(image, target, torch.ones(9, 8, dtype=torch.bool))
+    for other, mask in ((target[:5], None), (target, torch.ones(9, 8, dtype=torch.bool))):
+        with pytest.raises(ValueError, match="differ"):
+            psnr(image, other, mask)
 
 
 @pytest.mark.parametrize("shape", [(1000, 16, 3), (1100, 3), (9,), (1, 4)])

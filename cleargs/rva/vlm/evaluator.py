@@ -1,18 +1,15 @@
-"""Base class of the Qwen3-VL evaluators: it prepares images, caches scores and marks unscored frames.
+"""The evaluator ``qwen3-vl``: it prepares images, caches scores and marks unscored frames.
 
 The model gets each frame reduced to a maximum size, with masked pixels painted grey.
 """
 
 from __future__ import annotations
 
-import base64
-from abc import ABC, abstractmethod
+import json
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from cleargs.errors import StageError
@@ -20,64 +17,36 @@ from cleargs.progress import Reporter
 from cleargs.rva.config import QwenConfig
 from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, downscale, load_view
 from cleargs.rva.tables import CUE_COLUMNS
-from cleargs.types import ArrayF64, ImageU8
+from cleargs.rva.vlm.server import EncodedImage, QwenServer, UnscoredError
+from cleargs.types import ArrayF64
 
 _MASKED = 127  # mid-grey, as the prompt says
+_LONG_SIDE = 1024  # px; larger images are reduced to it
 
 
-@dataclass(frozen=True, eq=False)
-class EncodedImage:
-    """Image that the model gets."""
-
-    rgb: ImageU8  # [h, w, 3] sRGB
-    masked: bool
-    """True if parts are painted grey."""
-
-    def data_url(self) -> str:
-        """Return the image as the data URL of a PNG. A lossy format would add artifacts."""
-        _, png = cv2.imencode(".png", cv2.cvtColor(self.rgb, cv2.COLOR_RGB2BGR))
-        return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
-
-
-class UnscoredError(Exception):
-    """No valid scores for one frame, with the reason. Other frames may still be scored."""
-
-
-class QwenEvaluator(ABC):
-    """Evaluator ``qwen3-vl``: scores each frame separately with the model of a subclass.
+class QwenEvaluator:
+    """Evaluator ``qwen3-vl``: scores each frame separately, several of them at the same time.
 
     Scores are cached as soon as they arrive, so that an interrupted evaluation resumes.
     """
 
     version = QwenConfig.prompt
-    workers = 1
-    """Number of images that are scored in parallel, each in its thread."""
 
-    def __init__(self, config: QwenConfig, *, model: str, identity: str, cache: Path | None) -> None:
-        """Prepare the cache in the folder ``cache`` (None: no cache).
+    def __init__(self, config: QwenConfig, *, seed: int, cache: Path | None) -> None:
+        """Prepare the client of the server, and the cache in the folder ``cache`` (None: no cache).
 
-        ``identity`` is everything except the image that determines the scores.
+        Raises InputError if the server's address or key is invalid.
         """
-        self.name = f"qwen3-vl:{model}:prompt"
+        self.name = f"qwen3-vl:{config.model}:prompt"
         self._config = config
-        self._model = model
-        facts = [identity, self.version, config.image_size]
+        self._server = QwenServer(config, seed=seed)
+        identity = json.dumps(["server", config.model, config.max_tokens, seed])
+        facts = [identity, self.version, _LONG_SIDE]
         self._cache = ItemCache(cache, CUE_COLUMNS, facts, bounds=(0.0, 1.0))
 
-    @abstractmethod
     def check(self) -> None:
-        """Raise InputError if the model is unavailable."""
-
-    @abstractmethod
-    def score(self, image: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
-        """Return the cues of one image.
-
-        Raises UnscoredError if this image gets no scores, and StageError or InputError if no image would get
-        scores.
-        """
-
-    def stop(self) -> None:  # noqa: B027
-        """Stop work as soon as possible, if the subclass can. Called from another thread."""
+        """Raise InputError if the model is unavailable; see `QwenServer.check`."""
+        self._server.check()
 
     def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
         """Score all frames; see `Evaluator.evaluate`. ``threads`` is not used.
@@ -86,7 +55,7 @@ class QwenEvaluator(ABC):
         """
         cues = np.full((len(views), len(CUE_COLUMNS)), np.nan)
         faults: dict[int, str] = {}
-        pool = ThreadPoolExecutor(self.workers)
+        pool = ThreadPoolExecutor(self._config.concurrency)
         try:
             with reporter.task("cues", total=len(views)) as task:
                 rows = {pool.submit(self._cache.row, view, self._score): k for k, view in enumerate(views)}
@@ -97,13 +66,13 @@ class QwenEvaluator(ABC):
                         faults[rows[future]] = str(fault)
                     task.advance()
         except BaseException:
-            self.stop()
+            self._server.stop()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         pool.shutdown()
         if faults and len(faults) == len(views):
             raise StageError(
-                f"{self._model} scored no frame: {faults[0]}",
+                f"{self._config.model} scored no frame: {faults[0]}",
                 hint="check the server and rva.qwen, or use --set rva.evaluator=statistics",
             )
         for row in sorted(faults):
@@ -115,4 +84,4 @@ class QwenEvaluator(ABC):
         if mask is not None:
             rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
         masked = mask is not None and not mask.all()
-        return self.score(EncodedImage(downscale(rgb, self._config.image_size), masked))
+        return self._server.score(EncodedImage(downscale(rgb, _LONG_SIDE), masked))

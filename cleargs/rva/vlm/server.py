@@ -7,24 +7,25 @@ error messages never contain the key.
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from pathlib import Path
 from threading import Event
 from typing import Any
 
+import cv2
 import httpx2
 
 from cleargs.errors import InputError, StageError
 from cleargs.rva.config import QwenConfig, check_base_url
-from cleargs.rva.vlm.evaluator import EncodedImage, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
-from cleargs.types import ArrayF64
+from cleargs.types import ArrayF64, ImageU8
 
 URL_VARIABLE = "CLEARGS_VLM_URL"
 KEY_VARIABLE = "CLEARGS_VLM_API_KEY"
@@ -32,7 +33,10 @@ DEFAULT_URL = "http://127.0.0.1:8000/v1"
 
 _RETRY_STATUSES = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
 _MALFORMED = (ValueError, LookupError, TypeError, RecursionError)
+_ATTEMPTS = 5  # tries of one request if the server is busy, fails or does not answer
+_PAUSE_S = 1.0  # s before the second try; doubled before each further try
 _MAX_PAUSE_S = 120.0  # s between tries; also limits Retry-After
+_ASKS = 3  # questions per frame if the replies do not match the schema
 _MAX_REPLY_BYTES = 4 << 20
 _MAX_CHECK_S = 10.0  # s to wait for the list of models
 _MAX_QUOTED = 200  # characters of the server's text in a message
@@ -44,6 +48,24 @@ _RESPONSE_FORMAT = {
     "type": "json_schema",
     "json_schema": {"name": "cues", "strict": True, "schema": reply_schema()},
 }
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedImage:
+    """Image that the model gets."""
+
+    rgb: ImageU8  # [h, w, 3] sRGB
+    masked: bool
+    """True if parts are painted grey."""
+
+    def data_url(self) -> str:
+        """Return the image as the data URL of a PNG. A lossy format would add artifacts."""
+        _, png = cv2.imencode(".png", cv2.cvtColor(self.rgb, cv2.COLOR_RGB2BGR))
+        return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
+
+
+class UnscoredError(Exception):
+    """No valid scores for one frame, with the reason. Other frames may still be scored."""
 
 
 class RefusedError(UnscoredError):
@@ -60,14 +82,12 @@ class TransientError(UnscoredError):
         """True if no server listens at the address."""
 
 
-class QwenServer(QwenEvaluator):
+class QwenServer:
     """Sends chats to ``BASE/chat/completions``."""
 
-    def __init__(self, config: QwenConfig, *, seed: int, cache: Path | None) -> None:
+    def __init__(self, config: QwenConfig, *, seed: int) -> None:
         """Read the address and the key. Raise InputError if one of them is invalid."""
-        identity = json.dumps(["server", config.model, config.max_tokens, seed])
-        super().__init__(config, model=config.model, identity=identity, cache=cache)
-        self.workers = config.concurrency
+        self._config = config
         self._url = (config.base_url or os.environ.get(URL_VARIABLE, "").strip() or DEFAULT_URL).rstrip("/")
         try:
             check_base_url(self._url)
@@ -127,10 +147,12 @@ class QwenServer(QwenEvaluator):
                 hint=f"choose one with --set rva.qwen.model=NAME, or serve {model}",
             )
 
-    def score(self, image: EncodedImage) -> ArrayF64:
-        """Return the cues of one image; see `QwenEvaluator.score`.
+    def score(self, image: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
+        """Return the cues of one image.
 
-        After an invalid reply the model gets the error and is asked again, up to ``asks`` times in all.
+        After an invalid reply the model gets the error and is asked again, up to `_ASKS` times in all.
+
+        Raises UnscoredError if this image gets no scores, and StageError if no image would get scores.
         """
         if self._abandoned:
             raise UnscoredError(self._abandoned)  # do not wait for the same error again
@@ -140,7 +162,7 @@ class QwenServer(QwenEvaluator):
         ]
         question: dict[str, Any] = {"role": "user", "content": content}
         messages, fault = [question], ""
-        for _ in range(self._config.asks):
+        for _ in range(_ASKS):
             reply = self._reply(messages)
             try:
                 return parse_reply(reply)
@@ -152,7 +174,7 @@ class QwenServer(QwenEvaluator):
                 {"role": "assistant", "content": reply[:_MAX_REPEATED]},
                 {"role": "user", "content": complaint},
             ]
-        raise UnscoredError(f"the last of {self._config.asks} replies is invalid: {fault}")
+        raise UnscoredError(f"the last of {_ASKS} replies is invalid: {fault}")
 
     def _reply(self, messages: list[dict[str, Any]]) -> str:
         """Return the model's text, constrained to the schema if the server supports that."""
@@ -170,13 +192,13 @@ class QwenServer(QwenEvaluator):
         Raises UnscoredError if this chat gets no reply, and StageError if no chat would get one: wrong key,
         model or address.
         """
-        pause, tried = self._config.backoff_s, 0
+        pause, tried = _PAUSE_S, 0
         while True:
             try:
                 return self._try_once(body)
             except TransientError as fault:
                 tried += 1
-                last = tried == self._config.attempts
+                last = tried == _ATTEMPTS
                 if last or self._stopped.wait(min(_MAX_PAUSE_S, max(pause, fault.after))):
                     reason = f"{fault} ({tried} tries)"
                     self._abandoned = reason if fault.unreachable else self._abandoned

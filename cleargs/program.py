@@ -1,0 +1,34 @@
+"""The words that start this program in the user's shell, for the commands that it prints."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+PROGRAM = "CLEARGS_PROGRAM"
+"""Environment variable with these words. A path in it is absolute."""
+
+
+def name_program() -> None:
+    """Store in the environment how this program is started, also for the processes that it starts.
+
+    It is ``cleargs`` where the shell finds this installation under that name, or else its path.
+    """
+    if PROGRAM in os.environ:
+        return
+    script, found = Path(sys.executable).with_name("cleargs"), shutil.which("cleargs")
+    if found is not None and (Path(found) == script or Path(found) == Path(sys.argv[0]).absolute()):
+        os.environ[PROGRAM] = "cleargs"
+    else:
+        words = [str(script)] if script.is_file() else [sys.executable, "-m", "cleargs"]
+        os.environ[PROGRAM] = shlex.join(words)
+
+
+def program(folder: Path) -> str:
+    """Return the words that start this program in a shell whose working directory is ``folder``."""
+    name, *others = shlex.split(os.environ.get(PROGRAM, "cleargs"))
+    near = Path(name).is_relative_to(folder) and Path(name).parent != folder
+    return shlex.join([str(Path(name).relative_to(folder)) if near else name, *others])
