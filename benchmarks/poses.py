@@ -147,7 +147,7 @@ def _reconstructed(
 ) -> tuple[list[WorkFrame], list[Pose], float]:
     """Return the frames that SfM places, their poses, and the focal length."""
     sfm = _worker(frames, None, work, config)
-    model, _ = sfm._place_the_rest(sfm._map(), sfm._pairs())
+    model, _ = sfm._mapped(sfm._pairs())
     by_name = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     placed = [frame for frame in frames if frame.image in by_name]
     (work / "database.db").unlink()

@@ -71,7 +71,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update=limits)
 
 
-VERSION = 11
+VERSION = 12
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -162,7 +162,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     if len(capture.frames) < FEW_FRAMES:
         reporter.warn(f"there are only {len(capture.frames)} frames; a good scene needs 30 or more")
     long_side = max(config.feature_size, config.max_size)
-    capture = select_sharp_frames(capture, work, long_side, reporter)
+    capture = select_sharp_frames(capture, long_side, reporter)
     frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
     registered = {image.name for image in scene.model.images.values()}

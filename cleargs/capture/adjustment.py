@@ -17,6 +17,9 @@ FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
 """Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
 terms."""
 
+_SIMPLE = {"SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS}
+"""Models with no distortion that `FIRST_LENS` lacks."""
+
 SHARED_BY = 8
 """Fewest frames per camera from which cameras of the input are adjusted with its poses."""
 
@@ -80,7 +83,7 @@ class Adjuster:
         None where few points hold every frame.
         """
         refined = copy.deepcopy(model)
-        if cameras and _has_first_lens(refined):
+        if cameras and {camera.model.name for camera in refined.cameras.values()} <= _SIMPLE:
             set_lens(refined, FIRST_LENS)
         # At better poses more features find their points, so both are done in turn.
         for _ in range(_ROUNDS):
@@ -136,12 +139,6 @@ def set_lens(model: pycolmap.Reconstruction, lens: str) -> None:
         camera.model = getattr(pycolmap.CameraModelId, lens)
         more = [radial] if lens == FIRST_LENS else [radial, 0.0, 0.0, 0.0]
         camera.params = [*([focal] if lens == FIRST_LENS else [focal, focal]), *centre, *more]
-
-
-def _has_first_lens(model: pycolmap.Reconstruction) -> bool:
-    """Return True if `FIRST_LENS` has all distortion that the cameras of ``model`` have."""
-    simple = ("SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS)
-    return all(camera.model.name in simple for camera in model.cameras.values())
 
 
 def median_residual(model: pycolmap.Reconstruction) -> float:

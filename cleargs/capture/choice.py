@@ -11,83 +11,56 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.layouts.video import video_frame
 from cleargs.capture.prepare import reduced
 from cleargs.errors import InputError
-from cleargs.files import write_json
 from cleargs.media.video import decode_grey, read_timeline
 from cleargs.progress import Reporter
-from cleargs.safe_io import FAULTS, read_json
 from cleargs.types import ImageU8
-
-CHOICE = "chosen.json"
-"""In the folder of the working images: numbers of the frames that were chosen from the video."""
 
 _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 
 
-def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> Capture:
+def select_sharp_frames(capture: Capture, long_side: int, reporter: Reporter) -> Capture:
     """Return ``capture`` with each frame of a video exchanged for the sharpest of its stretch of time.
 
     The stretch of a frame is all frames that are nearer to its time than to that of another. Ties go to the
-    earlier one. Each video is decoded once, unless a killed run left its choice in ``folder``.
+    earlier one. Each video is decoded once.
     """
     if capture.kind != "video":
         return capture
-    frames: list[SourceFrame] = []
-    for number, video in enumerate(dict.fromkeys(frame.path for frame in capture.frames)):
-        ours = [frame for frame in capture.frames if frame.path == video]
-        file = folder / (CHOICE if number == 0 else f"{number}-{CHOICE}")
-        frames += _sharpest_of(video, ours, capture.stretch, file, long_side, reporter)
-    return replace(capture, frames=tuple(frames))
+    videos = dict.fromkeys(frame.path for frame in capture.frames)
+    chosen = (frame for video in videos for frame in _sharpest_of(video, capture, long_side, reporter))
+    return replace(capture, frames=tuple(chosen))
 
 
-def _sharpest_of(
-    video: Path,
-    frames: Sequence[SourceFrame],
-    stretch: tuple[float | None, float | None],
-    file: Path,
-    long_side: int,
-    reporter: Reporter,
-) -> Sequence[SourceFrame]:
-    """Return the sharpest frames near these of one video; ``file`` keeps their numbers for a killed run."""
-    timeline = read_timeline(video).between(*stretch)
+def _sharpest_of(video: Path, capture: Capture, long_side: int, reporter: Reporter) -> list[SourceFrame]:
+    """Return the sharpest frames near those of ``capture`` that are from ``video``."""
+    frames = [frame for frame in capture.frames if frame.path == video]
+    timeline = read_timeline(video).between(*capture.stretch)
     times = np.array([frame.pts for frame in frames], np.float64)
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, timeline.pts)
     if len(nearest) == len(times):
         return frames
-    chosen = _saved_choice(file, nearest, len(times))
-    if chosen is None:
-        best = np.full(len(times), -1.0)
-        chosen = [0] * len(times)
-        numbers = {pts: number for number, pts in enumerate(timeline.pts)}
-        with reporter.task("looking for sharp frames", len(numbers)) as task:
-            for pts, grey in decode_grey(video, numbers):
-                number = numbers[pts]
-                place, value = nearest[number], sharpness(reduced(grey, long_side))
-                if value > best[place]:
-                    best[place], chosen[place] = value, number
-                task.advance()
-        if (best < 0.0).any():
-            raise InputError(
-                f"{video.name}: of a stretch of it no frame can be decoded",
-                hint="convert the video with ffmpeg, or cut the damaged part off",
-            )
-        write_json(file, chosen)
+    best = np.full(len(times), -1.0)
+    chosen = [0] * len(times)
+    numbers = {pts: number for number, pts in enumerate(timeline.pts)}
+    with reporter.task("looking for sharp frames", len(numbers)) as task:
+        for pts, grey in decode_grey(video, numbers):
+            number = numbers[pts]
+            place, value = nearest[number], sharpness(reduced(grey, long_side))
+            if value > best[place]:
+                best[place], chosen[place] = value, number
+            task.advance()
+    if (best < 0.0).any():
+        raise InputError(
+            f"{video.name}: of a stretch of it no frame can be decoded",
+            hint="convert the video with ffmpeg, or cut the damaged part off",
+        )
     prefix = frames[0].name.rpartition("_")[0]
     return [video_frame(video, timeline, number, prefix) for number in chosen]
-
-
-def _saved_choice(file: Path, nearest: NDArray[np.intp], count: int) -> list[int] | None:
-    """Return the choice of a killed run, or None if there is none that fits."""
-    try:
-        chosen = [int(number) for number in read_json(file)]
-        return chosen if nearest[chosen].tolist() == list(range(count)) else None
-    except FAULTS:
-        return None
 
 
 def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey

@@ -110,6 +110,30 @@ def epipolar_errors(
     return np.concatenate(found)
 
 
+def weakest_join(model: pycolmap.Reconstruction, database: Path) -> tuple[int, float]:
+    """Return the image whose join with the images before it holds least, and the share of matches that hold.
+
+    A verified match between it or a later image and an earlier one holds if both features see the same point.
+    With different scales they see two. Only features that see points count; without any, the share is 1.
+    """
+    points = {
+        key: np.array([point.point3D_id for point in image.points2D], np.uint64)
+        for key, image in model.images.items()
+        if image.has_pose
+    }
+    counts, holding = np.zeros((2, max(points, default=0) + 1))
+    with pycolmap.Database.open(database) as opened:
+        geometries = _geometries(opened)
+    for (one, two), geometry in geometries.items():
+        if one in points and two in points and len(geometry.inlier_matches):
+            first, second = (points[key][geometry.inlier_matches[:, k]] for k, key in enumerate((one, two)))
+            seen = (first != pycolmap.INVALID_POINT3D_ID) & (second != pycolmap.INVALID_POINT3D_ID)
+            counts[one + 1 : two + 1] += seen.sum()
+            holding[one + 1 : two + 1] += (seen & (first == second)).sum()
+    share = np.divide(holding, counts, out=np.ones_like(counts), where=counts > 0)
+    return int(share.argmin()), float(share.min())
+
+
 def _distances(first: Any, second: Any, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(pycolmap.compute_squared_sampson_error(first, second, matrix))
 

@@ -163,8 +163,7 @@ def _require_whole(file: Path, end: Callable[[bytes, int], int]) -> None:
 
 
 def _count(data: bytes, at: int) -> int:
-    (number,) = struct.unpack_from("<Q", data, at)
-    return int(number)
+    return int(struct.unpack_from("<Q", data, at)[0])
 
 
 def _converted(model: pycolmap.Reconstruction) -> SparseModel:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,7 +64,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     paths = [images / f"{index:06d}.png" for index in range(len(capture.frames))]
     pairs = list(zip(capture.frames, paths, strict=True))
     with reporter.task("reading frames", len(paths)) as task:
-        todo = {path: frame for frame, path in pairs if not resumable(path, reporter)}
+        todo = {path: frame for frame, path in pairs if not _is_intact(path, reporter)}
         task.update(done=len(paths) - len(todo))
         for path, rgb in _pictures(todo):
             write_rgb(path, reduced(rgb, long_side))
@@ -83,9 +83,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             f"{(still == 0).mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
             "masked in all frames"
         )
-    prepared = [
-        _work_frame(frame, path, masks / f"{path.name}.png", still, reporter) for frame, path in pairs
-    ]
+    prepared = [_work_frame(frame, path, masks / f"{path.name}.png", still) for frame, path in pairs]
     if any(made.masked for made in prepared):
         for made in prepared:  # COLMAP leaves out an image that has none where others have
             mask = masks / f"{made.image}.png"
@@ -99,17 +97,15 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     return prepared
 
 
-def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = read_rgb) -> bool:
+def _is_intact(image: Path, reporter: Reporter) -> bool:
     """Return True if a killed run left ``image`` intact. A damaged file is removed with a warning."""
-    if not image.is_symlink() and not image.exists():
-        return False
-    try:
-        read(image)
-        return True
-    except InputError:
-        reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is written again")
-        remove(image)
-        return False
+    if image.is_symlink() or image.exists():
+        try:
+            return len(read_rgb(image)) > 0
+        except InputError:
+            reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is written again")
+            remove(image)
+    return False
 
 
 def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
@@ -158,9 +154,7 @@ def _alike(width: int, height: int, size: tuple[int, int]) -> bool:
     return bool(abs(w * height - h * width) <= max(width, height) + max(w, h))
 
 
-def _work_frame(
-    frame: SourceFrame, image: Path, mask: Path, still: MaskU8 | None, reporter: Reporter
-) -> WorkFrame:
+def _work_frame(frame: SourceFrame, image: Path, mask: Path, still: MaskU8 | None) -> WorkFrame:
     width, height = image_size(image)
     camera = frame.camera
     if camera is not None:
@@ -173,7 +167,7 @@ def _work_frame(
     stencil = read_stencil(frame)
     still = still if still is not None and still.shape == (height, width) else None
     masked = stencil is not None or still is not None
-    if masked and not resumable(mask, reporter, read_mask):
+    if masked:
         write_mask(mask, _stencilled(frame, stencil, still, width, height))
     transparent = stencil is not None and frame.mask is None
     return WorkFrame(frame, image.name, width, height, masked, camera, transparent)

@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics, guessed_camera
 from cleargs.capture.model import ModelImage, SparseModel, write_model
-from cleargs.capture.prepare import WorkFrame, resumable
+from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
-from cleargs.capture.undistort import Undistorter, undistorter
+from cleargs.capture.undistort import undistorter
 from cleargs.errors import StageError
 from cleargs.files import make_folder, remove
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.progress import Reporter
-from cleargs.types import ImageU8
 
 
 def publish(
@@ -41,12 +40,10 @@ def publish(
     The published model is returned. ``model`` is that of the working images in ``work``, ``placed`` says how
     the pose of each was found or why there is none, and ``test`` are the numbers of the test frames.
     """
-    make_folder(out / "images")
+    make_folder(out / "images", empty=True)
     remove(out / "masks")  # without the folder, no frame has a mask
     if any(frame.masked for frame in frames):
         make_folder(out / "masks")
-    for file in {*(out / "images").iterdir()} - {out / "images" / frame.image for frame in frames}:
-        remove(file)
     flat: list[Intrinsics] = []
     numbers: dict[Intrinsics, int] = {}
     images: dict[int, ModelImage] = {}
@@ -59,7 +56,11 @@ def publish(
         for index, (frame, lens) in enumerate(zip(frames, lenses, strict=True)):
             undistortion = undistorters[lens]
             flat.append(undistortion.pinhole)
-            rgb = _write_picture(frame, undistortion, work, out, reporter)
+            rgb = undistortion.image(read_rgb(work / "images" / frame.image))
+            write_rgb(out / "images" / frame.image, rgb)
+            if frame.masked:
+                mask = read_mask(work / "masks" / f"{frame.image}.png")
+                write_mask(out / "masks" / frame.image, undistortion.mask(mask))
             if frame.image in registered:
                 xy = undistortion.points(registered[frame.image].xy)
                 image = replace(registered[frame.image], xy=xy).select(undistortion.inside(xy))
@@ -106,22 +107,6 @@ def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Intrinsics
         alike = (other for other, _ in common if (other.width, other.height) == size)
         cameras.append(camera or next(alike, None) or guessed_camera("PINHOLE", *size))
     return cameras
-
-
-def _write_picture(
-    frame: WorkFrame, undistortion: Undistorter, work: Path, out: Path, reporter: Reporter
-) -> ImageU8:
-    """Undistort image and mask of a frame (a killed run may have done so) and return the image."""
-    target = out / "images" / frame.image
-    if resumable(target, reporter):
-        rgb = read_rgb(target)
-    else:
-        rgb = undistortion.image(read_rgb(work / "images" / frame.image))
-        write_rgb(target, rgb)
-    if frame.masked:
-        mask = read_mask(work / "masks" / f"{frame.image}.png")
-        write_mask(out / "masks" / frame.image, undistortion.mask(mask))
-    return rgb
 
 
 def _write_points(

@@ -81,6 +81,11 @@ def reconstruct(
     if not posed:
         model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
+        if outcome.torn_at is not None:
+            reporter.warn(
+                f"the frames before {frames[outcome.torn_at].source.name} may be at another scale: "
+                "use more frames (ingest.max_frames), or leave one part out"
+            )
         return _normalised(model, None, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
     worlds = _conventions(list(poses.values()), others=given is None)
@@ -107,11 +112,11 @@ def reconstruct(
             f"the poses do not fit the images in the convention of the input: read as {outcome.convention}"
         )
     _report_outcome(outcome, float(np.median(model.error)), config, reporter)
-    found = dict(outcome.placed) or dict.fromkeys(poses, "adjusted" if outcome.refined else "given")
+    found = dict(outcome.placed) or dict.fromkeys(poses, "given" if outcome.method == "given" else "adjusted")
     outcome = outcome.model_copy(update={"placed": _placed(frames, found)})
     if outcome.method == "sfm":
         return _normalised(model, worlds[outcome.convention][0], outcome)
-    if adopted is not None and len(adopted.error) and not outcome.refined:
+    if adopted is not None and len(adopted.error) and outcome.method == "given":
         model = adopted
     return Reconstruction(model, worlds[outcome.convention][0], outcome)
 
@@ -151,7 +156,7 @@ def _conventions(poses: Sequence[Pose], *, others: bool) -> dict[str, tuple[Simi
 def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, reporter: Reporter) -> None:
     """Say whether the input's poses were adjusted or found again, and by how much that explains more."""
     missed = outcome.missed_px or 0.0
-    if outcome.refined:
+    if outcome.method != "given":
         before, after = outcome.errors_px["given"], outcome.errors_px[outcome.method]
         what = "poses and cameras are adjusted to the images"
         if outcome.method == "sfm":

@@ -53,8 +53,5 @@ class SfmOutcome(FrozenModel):
     """Method -> median distance from their epipolar lines of matches that were kept out, px."""
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty: no camera was."""
-
-    @property
-    def refined(self) -> bool:
-        """Return True if the poses are not those of the input."""
-        return self.method != "given"
+    torn_at: int | None = None
+    """Number of the first frame after a join that contradicts its matches."""

@@ -34,7 +34,7 @@ from cleargs.capture.database import (
     set_cameras,
     why_missing,
 )
-from cleargs.capture.judging import epipolar_errors, verified_matches
+from cleargs.capture.judging import epipolar_errors, verified_matches, weakest_join
 from cleargs.capture.matching import loop_pairs, match_pairs, sequential_pairs
 from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
@@ -52,6 +52,9 @@ the truth than given ones, unless these are far off. All three, and the next, by
 _NEARER = 0.9
 """SfM is preferred to adjusted poses only if it lowers the mean error to at most this share: where both are
 right, they are alike, and adjusted poses are in the user's world exactly."""
+_JOINED, _JOINS = 0.92, 3
+"""Least share of the matches across a join whose features see one point, and most joins that are repeated
+(docs/experiments/poses.md)."""
 _FITS_PX, _FITS = 2.0, 0.5
 """Poses fit the images where at least this share of the matches is within this many pixels of its epipolar
 line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes, 0.13 with inverted ones."""
@@ -108,6 +111,7 @@ class _Sfm:
         self._database = job.folder / "database.db"
         self._matched = self._database
         """The database with the features by which frames were placed."""
+        self._torn_at: int | None = None
         self._output = job.folder / "model.partial"
         self._options = pycolmap.IncrementalPipelineOptions(
             num_threads=1, random_seed=job.seed, extract_colors=False
@@ -140,10 +144,10 @@ class _Sfm:
         if job.poses is not None:
             model, outcome = self._from_poses(job.poses, pairs)
         else:
-            model, placed = self._place_the_rest(self._map(), pairs)
+            model, placed = self._mapped(pairs)
             if job.config.camera_model == "auto":
                 model = Adjuster(self._matched, self._with_points).with_measured_lens(model)
-            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model))
+            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model), torn_at=self._torn_at)
         make_folder(self._output, empty=True)
         model.write_binary(self._output)
         write_json(self._output / OUTCOME, outcome.model_dump())
@@ -211,7 +215,7 @@ class _Sfm:
         unknown = job.model_copy(update={"cameras": guesses})
         set_cameras(self._database, colmap_cameras(unknown))
         try:
-            model, placed = self._place_the_rest(self._map(), pairs)
+            model, placed = self._mapped(pairs)
         except StageError:
             return None, {}
         if model.num_reg_images() < len(job.names):
@@ -275,6 +279,32 @@ class _Sfm:
             descriptors = [np.asarray(opened.read_descriptors(index + 1).data) for index in range(frames)]
         loops = loop_pairs(descriptors, config.loop_candidates, 2 * config.overlap, self._job.seed)
         return sorted({*near, *loops})
+
+    def _mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
+        """Return the model of the images alone, and how frames were placed."""
+        model, placed = self._place_the_rest(self._rejoined(self._map(), self._database), pairs)
+        return self._rejoined(model, self._matched), placed
+
+    def _rejoined(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
+        """Return ``model`` after the joins that contradict the matches across them were repeated.
+
+        The first pair of mapping may get a wrong focal length and depth, with which the first frames fit each
+        other; the next ones then go on at another scale. The smaller side of such a join is placed again from
+        the larger one.
+        """
+        image, share = weakest_join(model, database)
+        for _ in range(_JOINS):
+            if share >= _JOINED:
+                break
+            numbers = {found.image_id - 1 for found in model.images.values() if found.has_pose}
+            before = {i for i in numbers if i < image - 1}
+            found = self._continued(model, database, min(before, numbers - before, key=len), _FIRST)
+            again, better = weakest_join(found, database)
+            if better <= share or not _names_in(found) >= _names_in(model):
+                break
+            model, image, share = found, again, better
+        self._torn_at = image - 1 if share < _JOINED else None
+        return model
 
     def _map(self) -> pycolmap.Reconstruction:
         """Incremental mapping; the model with the most registered frames (the first of equals)."""
@@ -354,7 +384,7 @@ class _Sfm:
         models = pycolmap.incremental_mapping(
             database, self._job.images, self._output, options, input_path=start
         )
-        return max([model, *models.values()], key=lambda model: model.num_reg_images())
+        return max([*models.values(), model], key=lambda model: model.num_reg_images())
 
     def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
         """Return points at the given poses and cameras, which stay as they are here."""

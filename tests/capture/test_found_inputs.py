@@ -225,7 +225,7 @@ def test_a_folder_of_videos_is_one_capture(tmp_path: Path, ingest: Ingest) -> No
     capture = open_capture(folder, IngestConfig(max_frames=9))
     assert [frame.path.name for frame in capture.frames] == ["walk2.mp4"] * 6 + ["walk10.MP4"] * 3
     assert capture.frames[0].time_s == capture.frames[6].time_s == 0  # each has its own times
-    chosen = select_sharp_frames(capture, tmp_path, 64, SilentReporter())
+    chosen = select_sharp_frames(capture, 64, SilentReporter())
     assert len({frame.name for frame in chosen.frames}) == 9
     done = ingest(folder, max_frames=12, min_registered=0)
     assert [frame.name.split("_")[0] for frame in load_frames(done.out)] == ["walk2"] * 8 + ["walk10"] * 4
@@ -250,7 +250,7 @@ def test_a_stretch_of_a_video(tmp_path: Path) -> None:
     times = [frame.time_s for frame in capture.frames]
     assert np.allclose(times, [1.0, 1.3, 1.7, 2.0], atol=0.051)
     assert capture.frames[0].name == "walk_000010"  # the numbers are those of the whole video
-    chosen = select_sharp_frames(capture, tmp_path, 64, SilentReporter())
+    chosen = select_sharp_frames(capture, 64, SilentReporter())
     assert all(0.95 <= (frame.time_s or 0) <= 2.05 for frame in chosen.frames)
 
 

@@ -25,7 +25,7 @@ from eval_world import (
 
 from cleargs.capture.tables import FRAMES
 from cleargs.cli.main import invoke
-from cleargs.media.image import write_rgb
+from cleargs.media.image import read_rgb, write_rgb
 from cleargs.parquet import write_table
 
 Shell = Callable[..., tuple[int, str, str]]
@@ -288,7 +288,20 @@ def test_novel_views_are_aligned_by_the_observed_ones(shell: Shell, tmp_path: Pa
     code, out, _ = shell(sfm, "--reference", novel, *FAST)
     assert code == 0 and "residual 0.00%" in out
     (novel.parent / "observed").rename(tmp_path / "elsewhere")
-    fails(shell(sfm, "--reference", novel, *FAST), "too large for a comparison")
+    refused = shell(sfm, "--reference", novel, *FAST)
+    fails(refused, "too large for a comparison")
+    assert "--align DIR" in refused[2]
+
+
+def test_exposures_that_differ_are_named(shell: Shell, run: Path, truth: Path) -> None:
+    """The figure with the colours aligned is shown only where it differs."""
+    given = (run, "--reference", truth, "--stage", "g0", *FAST)
+    code, out, _ = shell(*given)
+    assert code == 0 and "exposures differ" not in out
+    for path in (truth / "images").iterdir():
+        write_rgb(path, (0.7 * read_rgb(path)).astype(np.uint8))
+    code, out, _ = shell(*given)
+    assert code == 0 and "g0: exposures differ: PSNR is" in out and "--align-colour" in out
 
 
 def test_a_figure_below_its_limit_fails(shell: Shell, run: Path, truth: Path) -> None:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, TokenError)
 """NumPy lets errors of Python's tokenizer through where the header is damaged."""
 
-
 POSES_BOUNDS = "poses_bounds.npy"
 """LLFF's file of poses."""
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -196,14 +197,14 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
         if not isinstance(frames, list) or not all(isinstance(values, dict) for values in frames):
             raise ValueError("'frames' is not a list of objects")
         entries = []
-        files = _Files(path.parent)
+        find = _finder(path.parent)
         for number, values in enumerate(frames):
             if not isinstance(values.get("file_path"), str):
                 raise ValueError(f"frames[{number}] has no file_path")
             if not isinstance(values.get("mask_path", ""), str):
                 raise ValueError(f"frames[{number}] has a mask_path that is not text")
-            mask = files.find(values["mask_path"]) if "mask_path" in values else None
-            entries.append(_Entry(values, files.find(values["file_path"]), mask))
+            mask = find(values["mask_path"]) if "mask_path" in values else None
+            entries.append(_Entry(values, find(values["file_path"]), mask))
         return data, entries
     except FAULTS as error:
         raise InputError(
@@ -212,30 +213,26 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
         ) from error
 
 
-class _Files:
-    """Finds the files that a listing names, also with another ending, case or folder."""
+def _finder(root: Path) -> Callable[[str], Path | None]:
+    """Return a function that finds the file that a listing in ``root`` names.
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
-        self._by_stem: dict[Path, dict[str, Path]] = {}
-        self._folders: list[Path] | None = None
+    Else it finds the image of its stem there, or in another folder if there is none of that name.
+    """
 
-    def find(self, listed: str) -> Path | None:
-        """Return the listed file, else the image of its stem there, else that in another folder; or None."""
-        path = self._root / listed.replace("\\", "/")
+    @cache
+    def by_stem(folder: Path) -> dict[str, Path]:
+        return {file.stem.lower(): file for file in sorted(image_files(folder), reverse=True)}
+
+    others = cache(partial(folders_to_search, root))
+
+    def find(listed: str) -> Path | None:
+        path = root / listed.replace("\\", "/")
         if path.is_file():
             return path
-        if (near := self._of_stem(path.parent, path.name)) is not None:
-            return near
-        if self._folders is None:
-            self._folders = folders_to_search(self._root)
-        found = (self._of_stem(folder, path.name) for folder in self._folders if not path.parent.is_dir())
+        # A listed name may have no ending, another ending, or lack a second one.
+        stems = path.name.lower(), path.stem.lower()
+        folders = [path.parent] if path.parent.is_dir() else others()
+        found = (by_stem(folder).get(stem) for folder in folders for stem in stems)
         return next((file for file in found if file is not None), None)
 
-    def _of_stem(self, folder: Path, name: str) -> Path | None:
-        if folder not in self._by_stem:
-            files = sorted(image_files(folder)) if folder.is_dir() else []
-            self._by_stem[folder] = {file.stem.lower(): file for file in reversed(files)}
-        stems = self._by_stem[folder]
-        # A listed name may have no ending, another ending, or lack a second one.
-        return stems.get(name.lower()) or stems.get(Path(name).stem.lower())
+    return find
