@@ -101,7 +101,7 @@ def _row(capture: Path, quality: Quality, plan: QualityPlan, folder: Path, repor
     done = run_capture(
         capture,
         folder / f"{capture_name(capture)}-{quality}",
-        workflow="default",  # replaces the settings of an earlier call
+        recipe="default",  # replaces the settings of an earlier call
         quality=quality,
         set={"ingest.holdout": HOLDOUT, **plan.settings},
         until=plan.until,
