@@ -241,15 +241,6 @@ def test_the_server_must_have_the_model(status: int, body: Any, cause: str | Non
         thread.join()
 
 
-def test_a_folder_without_a_model_is_an_error(tmp_path: Path) -> None:
-    pytest.importorskip("transformers", reason="the extra vlm is not installed")
-    settings = ["rva.qwen.model=", f"rva.qwen.model_dir={tmp_path}"]
-    config = load_config(installed(), "paper", settings).sections["rva"]
-    assert isinstance(config, RvaConfig)
-    with pytest.raises(InputError, match="cannot load a Qwen3-VL model"):
-        check_evaluator(config)
-
-
 def test_a_draft_limits_the_capture_and_trains_g0_to_its_end() -> None:
     """The user's settings are kept for a later run of another quality."""
     config = load_config(installed(), overrides=["g0.quality=draft", "ingest.max_frames=200"])
