@@ -114,8 +114,8 @@ def split_line(line: str) -> Iterator[tuple[str, ...]]:
     part: list[str] = []
     for word in [*lexer, ";"]:
         if set(word) <= set(";&"):
-            if ">" in part:
-                part = part[: part.index(">")]
+            redirected = [k for k, asked in enumerate(part) if set(asked) <= set("<>")]
+            part = part[: redirected[0]] if redirected else part
             while part and re.fullmatch(r"\w+=.*", part[0]):
                 part = part[1:]
             if part:
