@@ -38,6 +38,9 @@ _LABELS = {
     "musiq": "MUSIQ",
     "clip-iqa": "CLIP-\nIQA",
 }
+EXPOSURES_DIFFER = 0.5
+"""Gain of PSNR by aligned colours, dB, from which it is shown."""
+
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
 
@@ -302,8 +305,9 @@ def _regions(evaluation: Evaluation) -> str:
     if evaluation.psnr_white is not None:
         between = _figure("psnr", evaluation.psnr_between)
         words.append(f"over white {evaluation.psnr_white:.2f} dB, {between} dB from black")
-    if evaluation.psnr_colour_aligned is not None:
-        words.append(f"with aligned colours {evaluation.psnr_colour_aligned:.2f} dB")
+    plain, aligned = evaluation.means.get("psnr"), evaluation.psnr_colour_aligned
+    if plain is not None and aligned is not None and aligned - plain > EXPOSURES_DIFFER:
+        words.append(f"exposures differ: {aligned:.2f} dB with aligned colours (--align-colour)")
     if evaluation.covered is not None:
         words.append(f"{evaluation.covered:.1%} behind Gaussians in front of the true surface")
     return f"{_subject(evaluation)}: {'; '.join(words)}"

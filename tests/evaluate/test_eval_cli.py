@@ -301,7 +301,7 @@ def test_exposures_that_differ_are_named(shell: Shell, run: Path, truth: Path) -
     for path in (truth / "images").iterdir():
         write_rgb(path, (0.7 * read_rgb(path)).astype(np.uint8))
     code, out, _ = shell(*given)
-    assert code == 0 and "g0: exposures differ: PSNR is" in out and "--align-colour" in out
+    assert code == 0 and "exposures differ" in out and "--align-colour" in out
 
 
 def test_a_figure_below_its_limit_fails(shell: Shell, run: Path, truth: Path) -> None:
