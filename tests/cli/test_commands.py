@@ -144,9 +144,9 @@ def test_settings_that_cannot_be_kept(shell: Shell) -> None:
 def test_settings_that_this_version_does_not_have_are_named(shell: Shell) -> None:
     shell.run()
     file = shell.bench.folder / "run.toml"
-    file.write_text(file.read_text() + "\n[sqaure]\npower = 3\n")
+    file.write_text(file.read_text() + "\n[squarish]\npower = 3\n")
     code, _, err = again(shell)
-    assert code == 0 and "sqaure" in err
+    assert code == 0 and "squarish" in err
 
 
 def test_settings_lists_what_the_models_say(shell: Shell) -> None:
