@@ -53,7 +53,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
         return value
 
 
-FEW_FRAMES = 15
+FEW_FRAMES = 20
 """Number of frames below which a warning is given."""
 
 DRAFT_FRAMES, DRAFT_SIZE = 60, 640

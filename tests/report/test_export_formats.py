@@ -67,9 +67,12 @@ def test_nothing_is_overwritten_unasked(
     assert (tmp_path / "a.cameras.json").read_text() == "mine" and not (tmp_path / "a.ply").exists()
 
 
-def test_a_second_export_next_to_a_first(run: FinishedRun, tmp_path: Path) -> None:
+def test_a_second_export_next_to_a_first(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Once, the cameras of the first export made the second one fail."""
     assert export(run, tmp_path / "a.ply") == 0
+    assert capsys.readouterr().out.splitlines()[0].strip(), "scripts read the first line"
     assert export(run, tmp_path / "a.sog") == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "a.cameras.json",
