@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -178,3 +179,14 @@ def test_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for cell in code[1:]:
         exec(cell, names)
     assert isinstance(names["scene"], cg.Scene)
+
+
+def test_the_examples_of_the_pages(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of docs/api.md are the docstrings'. Pages call the run of a user `walk`."""
+    monkeypatch.chdir(place)
+    (place / "walk").symlink_to("run")
+    pages = [page for page in (EXAMPLES.parent / "docs").glob("*.md") if page.name != "api.md"]
+    codes = [code for page in pages for code in re.findall(r"(?ms)^```python\n(.*?)^```", page.read_text())]
+    assert codes
+    for code in codes:
+        exec(code, {})
