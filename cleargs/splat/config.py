@@ -63,11 +63,12 @@ class FormationConfig(Settings):
         "adjusted the poses, that is, unless those of the input fit within ingest.refine_above",
     )
     unexplained: float = Field(
-        0.1,
+        0.0,
         ge=0,
         le=1,
         description="difference of colour (sRGB, mean of a neighbourhood) above which a region that the "
-        "scene of the other frames does not explain is treated as movement and does not count; 0 = off",
+        "scene of the other frames does not explain is treated as movement and does not count; 0 = off, "
+        "0.1 where things move",
     )
 
     @field_validator("pose", mode="before")
