@@ -79,19 +79,30 @@ def write_depth(path: Path, depth: NDArray[Any]) -> None:  # [H, W]
 def read_depth(path: Path) -> PlaneF32:
     """Read the file of `write_depth`. Raises StoreError if it is missing, damaged, or has other channels."""
     try:
-        open_regular(path).close()
-        source = ImageInput.open(str(path))
-        if source is None:
-            raise ValueError(geterror().strip())
-        spec = source.spec()
-        if spec.channelnames != ("Z",) or spec.width * spec.height > MAX_PIXELS:
-            raise ValueError(f"{spec.width}x{spec.height} pixels of {spec.channelnames}, not of Z alone")
-        pixels = source.read_image(FLOAT)
-        if pixels is None:
-            raise ValueError(source.geterror().strip())
+        spec, pixels = _read(path, FLOAT)
+        if spec.channelnames != ("Z",):
+            raise ValueError(f"its channels are {spec.channelnames}, not Z alone")
     except FAULTS as error:
         raise StoreError(f"cannot read {path.name}: {cause(error)}", hint="delete the file") from error
     return np.ascontiguousarray(pixels[..., 0])
+
+
+def _read(path: Path, form: Any) -> tuple[ImageSpec, NDArray[Any]]:
+    """Return the header of a file and its pixels [H, W, C] as numbers of ``form``.
+
+    Raises one of `FAULTS` if the file is missing, damaged or too large.
+    """
+    open_regular(path).close()
+    source = ImageInput.open(str(path))
+    if source is None:
+        raise ValueError(geterror().strip())
+    spec = source.spec()
+    if spec.width * spec.height > MAX_PIXELS or spec.nchannels > _MAX_CHANNELS:
+        raise ValueError(f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels are too many")
+    pixels = source.read_image(form)
+    if pixels is None:
+        raise ValueError(source.geterror().strip())
+    return spec, np.asarray(pixels)
 
 
 def _write(
@@ -126,16 +137,7 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
         StoreError: the file is missing, damaged, or has a channel outside an RGB layer.
     """
     try:
-        open_regular(path).close()
-        source = ImageInput.open(str(path))
-        if source is None:
-            raise ValueError(geterror().strip())
-        spec = source.spec()
-        if spec.width * spec.height > MAX_PIXELS or spec.nchannels > _MAX_CHANNELS:
-            raise ValueError(f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels are too many")
-        pixels = source.read_image(HALF)
-        if pixels is None:
-            raise ValueError(source.geterror().strip())
+        spec, pixels = _read(path, HALF)
         place = {name: k for k, name in enumerate(spec.channelnames)}
         # The plain channels are one of the layers again.
         names = dict.fromkeys(name.rpartition(".")[0] for name in place if name not in _CHANNELS)
