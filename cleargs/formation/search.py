@@ -87,12 +87,13 @@ def search(
             straight = _best(level, [straight, still], model, steps, pose)
             if level is levels[-1] or BLUR not in _ACTIVE[model]:
                 continue
-            start = min(straight, curved, key=level.cost)
-            if _explains(level, start, still):
-                curved = _best(level, [start], model, steps, pose, MAX_ORDER)
+            if (best := _promising(level, [straight, curved], still)) is not None:
+                curved = _best(level, [best], model, steps, pose, MAX_ORDER)
         found.append((model, straight))
         if straight.blur.any() or curved.blur.any():
-            paths = _curved(levels[-1], [straight, curved, still], model, LEVELS[len(levels) - 1][1], pose)
+            paths = [_best(level, [straight], model, steps, pose, 2)]
+            if (best := _promising(level, [*paths, curved], still)) is not None:
+                paths.append(_best(level, [best], model, steps, pose, MAX_ORDER))
             found += [(model, path) for path in paths]
     if defocus:
         disc = _sharpest_disc(coarse, still)
@@ -140,9 +141,11 @@ def preferred(found: list[MotionFit]) -> MotionFit:
     return min(found, key=cost)
 
 
-def _explains(level: Level, motion: FrameMotion, still: FrameMotion) -> bool:
-    """Return True if ``motion`` explains enough at this size for a cubic path to be tried."""
-    return level.cost(motion) < (1.0 - BEND_SHARE) * level.cost(still)
+def _promising(level: Level, paths: list[FrameMotion], still: FrameMotion) -> FrameMotion | None:
+    """Return the best of ``paths``; None if it explains too little here for a cubic path to be tried."""
+    costs = [level.cost(path) for path in paths]
+    enough = min(costs) < (1.0 - BEND_SHARE) * level.cost(still)
+    return paths[costs.index(min(costs))] if enough else None
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
@@ -170,21 +173,6 @@ def _best(
         unknowns[rows, np.searchsorted(active[TWIST:], BEND.start + rows)] = 1.0 / 12.0
     ends = [_descend(level, start, active, steps, unknowns) for start in starts]
     return min(ends, key=level.cost)
-
-
-def _curved(
-    level: Level, paths: list[FrameMotion], model: Model, steps: int, pose: bool
-) -> list[FrameMotion]:
-    """Return the quadratic path at the finest level, and the cubic one where it may explain more.
-
-    ``paths`` are the straight one, that of the levels before, and none.
-    """
-    straight, curved, still = paths
-    quadratic = _best(level, [straight], model, steps, pose, 2)
-    start = min(quadratic, curved, key=level.cost)
-    if not _explains(level, start, still):
-        return [quadratic]
-    return [quadratic, _best(level, [start], model, steps, pose, MAX_ORDER)]
 
 
 def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
