@@ -8,6 +8,8 @@ import shutil
 import sys
 from pathlib import Path
 
+from cleargs.subprocesses import module_command
+
 PROGRAM = "CLEARGS_PROGRAM"
 """Environment variable with these words. A path in it is absolute."""
 
@@ -23,7 +25,7 @@ def name_program() -> None:
     if found is not None and (Path(found) == script or Path(found) == Path(sys.argv[0]).absolute()):
         os.environ[PROGRAM] = "cleargs"
     else:
-        words = [str(script)] if script.is_file() else [sys.executable, "-m", "cleargs"]
+        words = [str(script)] if script.is_file() else module_command("cleargs")
         os.environ[PROGRAM] = shlex.join(words)
 
 
