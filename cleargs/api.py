@@ -87,7 +87,7 @@ def run(
         seed=seed,
         store=None if store is None else Path(store),
         device=device,
-        say=reporter.info,
+        reporter=reporter,
     )
     with opened_store(spec.store) as opened:
         runner = Runner(dag, spec, opened, threads or usable_cores(), reporter)

@@ -244,7 +244,7 @@ class Batch:
             overrides=(*self.overrides, *scene.overrides),
             store=self._store,
             device="cpu",
-            say=lambda line: None,
+            reporter=SilentReporter(),
         )
         before = read_metadata(run.folder) if self.falls_back else RunMetadata()
         # The device is not checked: a login node may not have it.

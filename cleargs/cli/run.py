@@ -176,7 +176,7 @@ def run(
             store=store,
             device=device,
             test_gpu=not dry_run,
-            say=reporter.info,
+            reporter=reporter,
         )
         for line in without_effect(settings.config, given):
             reporter.warn(line)

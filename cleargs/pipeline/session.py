@@ -23,6 +23,7 @@ from cleargs.pipeline.run_file import (
     read_source,
 )
 from cleargs.pipeline.store import STORE_FOLDER, Store
+from cleargs.progress import Reporter
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
@@ -105,13 +106,13 @@ def resolve_run(
     store: Path | None = None,
     device: DeviceChoice = "auto",
     test_gpu: bool = True,
-    say: Callable[[str], None],
+    reporter: Reporter,
 ) -> RunSpec:
     """Return the run of a capture, with everything that decides its results.
 
     An existing run keeps its settings, store and device unless an argument gives others. A ``recipe`` or
     ``reset`` starts from the recipe instead. ``test_gpu`` lets the device "auto" run the self-test of a GPU.
-    ``say`` receives messages about the device, and about settings that the run keeps.
+    ``reporter`` receives messages about the device, and about settings that the run keeps or loses.
 
     Raises:
         InputError: ``source`` does not exist or is a run.
@@ -134,7 +135,7 @@ def resolve_run(
         settings, others = known_settings(dag, {} if forgets else metadata.settings)
         kept = check_document(dag, settings) if settings else None
         if others:
-            say(f"settings of {folder / RUN_FILE} that this version does not have: {_listed(others)}")
+            reporter.warn(f"{folder / RUN_FILE} has settings that do not exist, left out: {_listed(others)}")
     except ConfigError as error:
         if not forgets:
             raise ConfigError(
@@ -143,12 +144,14 @@ def resolve_run(
     config = load_config(dag, recipe or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
     keeps = device == "auto" and metadata.device is not None
-    chosen = resolve_device(device, say, kept=metadata.device, test=test_gpu)
+    chosen = resolve_device(device, reporter.info, kept=metadata.device, test=test_gpu)
     if kept is not None:
         own = [f"seed={kept.seed}"] if kept.seed else []
         own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
         if own:
-            say(f"settings kept from {folder / RUN_FILE}: {_listed(own)}; --reset starts from the recipe")
+            reporter.info(
+                f"settings kept from {folder / RUN_FILE}: {_listed(own)}; --reset starts from the recipe"
+            )
     on_cpu = metadata.on_cpu if keeps else ()
     return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")
 

@@ -167,7 +167,7 @@ def run_on(
         recipe=str(recipe),
         store=store,
         device=device,
-        say=bench.remarks.info,
+        reporter=bench.remarks,
     )
     with DigestMemo(settings.store / "digests.sqlite") as memo:
         runner = Runner(bench.dag, settings, Store(settings.store, memo), 1, bench.remarks)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from toy import Remarks
 
 from cleargs.errors import ConfigError
 from cleargs.pipeline.config import check_document, known_settings, load_config
@@ -37,10 +38,10 @@ def test_old_run_takes_new_settings(tmp_path: Path) -> None:
     """A setting that is gone does not contradict the new settings, and is named."""
     (tmp_path / "capture").mkdir()
     (tmp_path / RUN_FILE).write_text(OLD)
-    overrides, said = ["g0.quality=high", "g0.lr_means=1e-4"], list[str]()
-    run = resolve_run(installed(), tmp_path / "capture", tmp_path, overrides=overrides, say=said.append)
+    overrides, remarks = ["g0.quality=high", "g0.lr_means=1e-4"], Remarks()
+    run = resolve_run(installed(), tmp_path / "capture", tmp_path, overrides=overrides, reporter=remarks)
     assert run.config == load_config(installed(), "smoke", [*OTHER_DEFAULTS, *overrides])
-    (line,) = (line for line in said if "does not have" in line)
+    (line,) = remarks.warnings
     assert "rva.stand_in_share" in line and " more" in line
 
 

@@ -206,12 +206,12 @@ def test_a_damaged_device_hides_neither_input_nor_store(bench: Bench) -> None:
     shared, recipe = bench.root / "shared", bench.root / "empty.toml"
     recipe.touch()
     (bench.folder / "run.toml").write_text(f'input = "/elsewhere"\nstore = "{shared}"\ndevice = "tpu"\n')
-    run = resolve_run(bench.dag, bench.capture, bench.folder, recipe=str(recipe), say=lambda line: None)
+    run = resolve_run(bench.dag, bench.capture, bench.folder, recipe=str(recipe), reporter=bench.remarks)
     assert run.store == shared
     with pytest.raises(InputError, match="is a run of /elsewhere"), opened_store(shared) as store:
         check_same_input(run, bench.dag, store)
     with pytest.raises(ConfigError, match="damaged"):
-        resolve_run(bench.dag, bench.capture, bench.folder, say=lambda line: None)
+        resolve_run(bench.dag, bench.capture, bench.folder, reporter=bench.remarks)
 
 
 def test_a_pipe_for_a_run_file(bench: Bench) -> None:
