@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -79,8 +78,8 @@ def test_a_run_of_the_library_logs(
     (tmp_path / "photos").mkdir()
     caplog.set_level(logging.INFO, "cleargs")
 
-    def resolve(*arguments: object, say: Callable[[str], None], **options: object) -> None:
-        say("as in run.toml")
+    def resolve(*arguments: object, reporter: progress.Reporter, **options: object) -> None:
+        reporter.info("as in run.toml")
         raise InputError("stop", hint="here")
 
     monkeypatch.setattr(api, "resolve_run", resolve)
