@@ -57,7 +57,7 @@ def cell(variant: str, seed: int, psnr: float) -> Cell:
 
 def test_the_list_has_valid_settings_and_names_its_sources() -> None:
     listed = read_real_list()
-    assert [scene.name for scene in listed.scenes] == ["blurball", "kitchen", "office", "fox", "bonsai"]
+    assert [scene.name for scene in listed.scenes] == ["blurball", "kitchen", "office", "fox", "terrace", "bonsai"]
     for scene in listed.scenes:
         config = load_config(installed(), "default", scene.settings, 0)
         assert config.sections["ingest"].holdout != "none"  # type: ignore[attr-defined]
@@ -95,7 +95,7 @@ def test_the_short_table_has_a_row_per_scene() -> None:
     assert row.endswith("| 29.00 / 0.200 (29.50) | 30.00 / 0.200 (30.50) | 2.0 and 2.0 |")
     assert "| *Deblur-NeRF, 200,000 iterations, on blurball* |  | *27.33 / 0.223* |  |" in table
     assert "Version blurball 0.2.0, abc (mean of 2 trainings)." in table and "CoMoGaussian" not in table
-    assert "Still to be measured: kitchen, office, fox, bonsai." in table
+    assert "Still to be measured: kitchen, office, fox, terrace, bonsai." in table
 
 
 def test_scenes_of_an_earlier_call_stay_with_their_version(tmp_path: Path) -> None:
