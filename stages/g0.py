@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -56,7 +56,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 31
+VERSION = 32
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -107,7 +107,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
     from cleargs.formation.frames import real_views
-    from cleargs.formation.movement import write_movement
+    from cleargs.formation.movement import TOLERANCE, write_movement
     from cleargs.formation.observed import evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
@@ -147,6 +147,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
         config.formation,
         exposure=exposure,
         lr_exposure=config.lr_exposure,
+        tolerance=TOLERANCE if movement_expected(config, allocation) else 0.0,
         draft=config.quality == "draft",
     )
     trainer = Trainer(
@@ -200,6 +201,14 @@ def _exposure(
     if config.exposure == "off" or (config.exposure == "auto" and spread <= config.exposure_threshold):
         return None, spread
     return Exposure.from_gains([view.frame_id for view in views], gains), spread
+
+
+def movement_expected(config: G0Config, allocation: Sequence[Mapping[str, Any]]) -> bool:
+    """Return True if movement is to be looked for, by the rows of ``rva/frames.parquet``."""
+    from cleargs.formation.movement import HIDING
+
+    asked = config.formation.movement
+    return asked == "on" or (asked == "auto" and any(row["b_ghosting"] >= HIDING for row in allocation))
 
 
 def _mean(values: list[float]) -> float | None:

@@ -27,7 +27,7 @@ FIRST = {
     "g0.budget": "more Gaussians for more detail, fewer for a small file",
     "g0.exposure": "`on` if the brightness of the video changes",
     "rva.tau_R": "lower if too few frames are trusted, higher if blurred ones are",
-    "g0.formation.unexplained": "0.1 if people or things move: they are left out",
+    "g0.formation.movement": "`on` if something moves and the default does not leave it out",
     "rivr.expert": "another network for repairs",
 }
 """Setting -> reason to change it, for the table at the top."""

@@ -83,6 +83,7 @@ class CaptureFormation:
         lr_exposure: float = 0.0,
         known: Mapping[int, FrameFormation] | None = None,
         moving: Mapping[int, MaskBool] | None = None,
+        tolerance: float = 0.0,
         draft: bool = False,
     ) -> None:
         """Begin with what is known of the frames.
@@ -94,6 +95,7 @@ class CaptureFormation:
             lr_exposure: Learning rate of the affines.
             known: Formations from an earlier training, by frame_id.
             moving: Cells that move, likewise.
+            tolerance: Difference of mean colours from which a cell can move; 0: nothing more is looked for.
             draft: Search frames only where the test finds blur, also at the first look.
         """
         weighted = [view for view in views if view.weight > 0.0]
@@ -109,7 +111,7 @@ class CaptureFormation:
         estimated = {view.frame_id for view in weighted if view.kind == "real" and view.estimated}
         self._posed = {"auto": estimated, "on": set(real), "off": set[int]()}[config.pose]
         cameras = {view.frame_id: view.camera for view in weighted}
-        self._movement = Movement(cameras, config.unexplained, moving)
+        self._movement = Movement(cameras, tolerance, moving)
         self._draws = dict.fromkeys(cameras, 0)
 
     @property

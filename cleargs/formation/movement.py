@@ -32,6 +32,10 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.types import Render
 from cleargs.types import ArrayF32, ArrayF64, MaskBool
 
+TOLERANCE = 0.1
+"""Difference of mean colours, sRGB in [0, 1], up to which nothing moves."""
+HIDING = 0.5
+"""Ghosting of a frame, by RVA, from which movement is looked for. Still captures reach 0.45, by blur."""
 CELLS = 32
 """Cells along the longer side of a frame."""
 MEDIAN_FACTOR = 5.0

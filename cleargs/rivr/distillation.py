@@ -20,7 +20,7 @@ from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.deblur import deblur
 from cleargs.formation.exposure import apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, fit_motion
-from cleargs.formation.movement import read_movement, still_pixels, write_movement
+from cleargs.formation.movement import TOLERANCE, read_movement, still_pixels, write_movement
 from cleargs.formation.observed import FormedView, evaluate_views, pooled_unseen, render_observed
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.models.scorer import Scorer
@@ -235,6 +235,7 @@ class TrainedScene:
                 lr_exposure=config.lr_exposure,
                 known=self.formations,
                 moving=self.moving,
+                tolerance=TOLERANCE if self.moving else 0.0,
             )
             even = sum(view.kind == "pseudo" for view in views) / len(views)
             share = even if pseudo_share == "even" else pseudo_share * repaired

@@ -62,13 +62,10 @@ class FormationConfig(Settings):
         description="correct the pose of a frame together with its motion; auto = where ingest found or "
         "adjusted the poses, that is, unless those of the input fit within ingest.refine_above",
     )
-    unexplained: float = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description="difference of colour (sRGB, mean of a neighbourhood) above which a region that the "
-        "scene of the other frames does not explain is treated as movement and does not count; 0 = off, "
-        "0.1 where things move",
+    movement: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="leave regions out that move, that is, differ from the scene of the other frames; "
+        "auto = where RVA finds something in front of the scene in a frame (ghosting of 0.5 or more)",
     )
 
     @field_validator("pose", mode="before")

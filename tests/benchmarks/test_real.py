@@ -57,7 +57,14 @@ def cell(variant: str, seed: int, psnr: float) -> Cell:
 
 def test_the_list_has_valid_settings_and_names_its_sources() -> None:
     listed = read_real_list()
-    assert [scene.name for scene in listed.scenes] == ["blurball", "kitchen", "office", "fox", "terrace", "bonsai"]
+    assert [scene.name for scene in listed.scenes] == [
+        "blurball",
+        "kitchen",
+        "office",
+        "fox",
+        "terrace",
+        "bonsai",
+    ]
     for scene in listed.scenes:
         config = load_config(installed(), "default", scene.settings, 0)
         assert config.sections["ingest"].holdout != "none"  # type: ignore[attr-defined]

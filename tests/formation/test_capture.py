@@ -299,8 +299,9 @@ def test_what_moves_teaches_little(tmp_path: Path) -> None:
     """
     errors = {}
     for name, tolerance, motions in (("plain", 0.0, True), ("doubted", 0.05, True), ("alone", 0.05, False)):
-        look = FormationConfig(start=0.0, unexplained=tolerance, enabled=motions)
-        trained = run(tmp_path / name, crossed(), CaptureFormation(crossed(), look))
+        look = FormationConfig(start=0.0, enabled=motions)
+        formation = CaptureFormation(crossed(), look, tolerance=tolerance)
+        trained = run(tmp_path / name, crossed(), formation)
         shown = [render_observed(trained.scene, view) - render_observed(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
     assert errors["doubted"] < 0.2 * errors["plain"], errors
@@ -326,7 +327,7 @@ def test_a_repair_does_not_teach_where_its_frame_moves() -> None:
 def test_where_nothing_moves_a_training_has_the_bits_of_one_without_looks(tmp_path: Path) -> None:
     seen, scenes = views(blurred=None), []
     for name, tolerance in (("off", 0.0), ("on", 0.05)):
-        formation = CaptureFormation(seen, FormationConfig(enabled=False, unexplained=tolerance))
+        formation = CaptureFormation(seen, FormationConfig(enabled=False), tolerance=tolerance)
         scenes.append(run(tmp_path / name, seen, formation).scene.gaussians.tensors())
     assert all(torch.equal(tensor, scenes[1][name]) for name, tensor in scenes[0].items())
 

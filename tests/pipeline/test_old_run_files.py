@@ -23,7 +23,6 @@ OTHER_DEFAULTS = [
     "ingest.camera_model=SIMPLE_RADIAL",
     "rivr.targets=auto",
     "g0.formation.pose=off",
-    "g0.formation.unexplained=0.0",
     "g0.background=[0.0, 0.0, 0.0]",
 ]
 """Settings that the recipe had then and has no longer. A run keeps those of its file."""

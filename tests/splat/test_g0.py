@@ -83,8 +83,13 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
             judged.append(
                 dict.fromkeys(RVA_FRAMES.names, 0.5)
                 | {"frame_id": frame_id, "name": image, "evaluator": "toy-1", "bin": 0}
-                | {"reliable": frame_id in ACTIVE, "stand_in": False, "reactivated_for": None}
-                | {"weight": ACTIVE.get(frame_id, 0.0)}
+                | {
+                    "b_ghosting": 0.0,
+                    "reliable": frame_id in ACTIVE,
+                    "stand_in": False,
+                    "reactivated_for": None,
+                }
+                | {"weight": ACTIVE.get(frame_id, 0.0), "b_ghosting": 0.0}
                 | {"role": "strong" if ACTIVE.get(frame_id, 0.0) > 0.8 else "suppressed"}
             )
     write_table(root / "ingest" / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
@@ -246,3 +251,14 @@ def test_kernels_are_compiled_before_the_progress_bar(capture: Path, tmp_path: P
     environment = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
     assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("asked", "ghosting", "expected"),
+    [("auto", 0.45, False), ("auto", 0.5, True), ("on", 0.0, True), ("off", 1.0, False)],
+)
+def test_movement_is_looked_for_where_something_hides_the_scene(
+    asked: str, ghosting: float, expected: bool
+) -> None:
+    config = G0Config.model_validate({"formation": {"movement": asked}})
+    assert g0.movement_expected(config, [{"b_ghosting": 0.0}, {"b_ghosting": ghosting}]) is expected
