@@ -34,8 +34,8 @@ from cleargs.types import ArrayF32, ArrayF64, MaskBool
 
 TOLERANCE = 0.1
 """Difference of mean colours, sRGB in [0, 1], up to which nothing moves."""
-HIDING = 0.5
-"""Ghosting of a frame, by RVA, from which movement is looked for. Still captures reach 0.45, by blur."""
+HIDING = 0.3
+"""Ghosting of a frame, by RVA, from which movement is looked for (docs/movement.md)."""
 CELLS = 32
 """Cells along the longer side of a frame."""
 MEDIAN_FACTOR = 5.0

@@ -65,7 +65,7 @@ class FormationConfig(Settings):
     movement: Literal["auto", "on", "off"] = Field(
         "auto",
         description="leave regions out that move, that is, differ from the scene of the other frames; "
-        "auto = where RVA finds something in front of the scene in a frame (ghosting of 0.5 or more)",
+        "auto = where RVA finds something in front of the scene in a frame (ghosting of 0.3 or more)",
     )
 
     @field_validator("pose", mode="before")

@@ -255,7 +255,7 @@ def test_kernels_are_compiled_before_the_progress_bar(capture: Path, tmp_path: P
 
 @pytest.mark.parametrize(
     ("asked", "ghosting", "expected"),
-    [("auto", 0.45, False), ("auto", 0.5, True), ("on", 0.0, True), ("off", 1.0, False)],
+    [("auto", 0.25, False), ("auto", 0.35, True), ("on", 0.0, True), ("off", 1.0, False)],
 )
 def test_movement_is_looked_for_where_something_hides_the_scene(
     asked: str, ghosting: float, expected: bool
