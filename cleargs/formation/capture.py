@@ -135,10 +135,11 @@ class CaptureFormation:
             w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
 
         rho is the median misfit of the frames, each counted with its w_RVA, and p is `FormationConfig.trust`.
-        A frame that its model explains as well as reliable frames are explained has the weight of one.
+        A frame that is explained as well as reliable frames are has the weight of one, with a model of its
+        exposure or without: RVA takes soft things, such as fur, for a soft photograph.
         """
         prior, frame = self._weights[frame_id], self._frames[frame_id]
-        if frame.model == "none" or frame.misfit <= 0.0:
+        if frame.misfit <= 0.0:  # not compared with the scene so far
             return prior
         reference = median_misfit(self._frames.values(), self._weights)
         trust: float = min(1.0, reference / frame.misfit) ** self._config.trust
@@ -207,7 +208,7 @@ class CaptureFormation:
         if view.kind == "real" or frame_id not in self._frames:
             looks = self._movement.due(self._draws[frame_id], progress)
             self._draws[frame_id] += 1
-        if motion is None and affine is None and mask is own and not looks:
+        if motion is None and affine is None and mask is own and weight == view.weight and not looks:
             return None
         return FormedView(
             camera,

@@ -452,7 +452,14 @@ def test_trust_is_earned() -> None:
     assert [formation.weight(k) for k in (0, 1, 3)] == [1.0, 1.0, 1.0]
     # The weights add up to 3.3; half of that is reached at the second of .008, .010, .012, .016 and .05.
     assert formation.weight(2) == pytest.approx(0.010 / 0.016)
-    assert formation.weight(4) == 0.1  # not explained: RVA's
+    assert formation.weight(4) == pytest.approx(0.010 / 0.05)
+    assert CaptureFormation(seen, LOOK).weight(4) == 0.1  # not compared with the scene so far: RVA's
+
+
+def test_a_frame_without_a_fault_earns_trust_by_its_misfit() -> None:
+    """RVA gave soft close-ups of fur a tenth of the weight, and views near them lost 3 dB."""
+    known = {k: FrameFormation(k, misfit=0.010, misfit_still=0.010) for k in range(FRAMES)}
+    assert CaptureFormation(views(weights=[1.0, 1.0, 1.0, 1.0, 0.12]), LOOK, known=known).weight(4) == 1.0
 
 
 def test_the_table_gives_back_what_was_found(tmp_path: Path) -> None:
