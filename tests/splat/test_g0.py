@@ -131,7 +131,8 @@ def test_only_active_frames_train_the_scene(capture: Path, tmp_path: Path) -> No
     result = g0.run(context(capture, tmp_path))
     assert {path.name for path in (tmp_path / "out").iterdir()} == set(g0.OUTPUTS)
     rows = read_table(tmp_path / "out" / "train.parquet", TRAIN).to_pylist()
-    assert {row["frame_id"]: row["weight"] for row in rows} == pytest.approx(ACTIVE)
+    first = {row["frame_id"]: row["weight"] for row in reversed(rows)}  # later they may earn more
+    assert first == pytest.approx(ACTIVE)
     scene = read_ply(tmp_path / "out" / "scene.ply")
     summary = dict(result.summary)
     assert summary["gaussians"] == scene.gaussians.num == 120
