@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from cleargs.splat.camera import Camera
@@ -63,3 +64,17 @@ class Formation(Protocol):
 
     def fault(self) -> str | None:
         """Return a description of values that are not finite, or None."""
+
+
+SATURATED = 253 / 255
+"""Value of a photograph from which it is saturated: the light there was as bright as this or brighter."""
+
+
+def recorded(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a render as a sensor records it, and where it is brighter than a saturated photograph.
+
+    Both images are [H, W, 3] sRGB. The values there, per channel, become those of the photograph, since it
+    does not tell how bright they are. So a lamp does not get darker because one frame was overexposed.
+    """
+    too_bright = (target >= SATURATED) & (image > target)
+    return torch.where(too_bright, target, image), too_bright

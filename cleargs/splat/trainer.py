@@ -28,7 +28,7 @@ from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
 from cleargs.splat.budget import resolve_config, seconds_by_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
-from cleargs.splat.formation import Formation, Formed
+from cleargs.splat.formation import Formation, Formed, recorded
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.interruption import deferred_sigterm
 from cleargs.splat.kernels.cpu.jit import compiled_mark
@@ -217,8 +217,9 @@ class Trainer:
         render = self._render(camera, depth=depth, background=colour)
         image = render.image if formed is None else formed.forward(render)
         mask = mask if formed is None else formed.mask
+        image, too_bright = recorded(image, target)
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
-        gradient = self._add_loss(image, target, mask, weight)
+        gradient = self._add_loss(image, target, mask, weight).masked_fill_(too_bright, 0.0)
         if config.densify and self._schedule.wants_errors(schedule_step):
             errors = self._error_per_gaussian(image, target, mask, weight, formed)
             self._errors = errors if self._errors is None else self._errors + errors

@@ -24,6 +24,7 @@ from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
+from cleargs.splat.formation import recorded
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
@@ -116,6 +117,41 @@ def test_what_was_filmed_becomes_opaque(tmp_path: Path) -> None:
         shown = [render(trained.scene.gaussians, view.camera).alpha for view in views(dark)]
         alphas.append(float(torch.stack(shown).mean()))
     assert alphas[0] > 0.99 and alphas[1] < 0.9  # measured: 0.999 and 0.837
+
+
+def test_saturated_pixels_do_not_darken_the_scene(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    exposed = np.stack([np.eye(3, 4) * (2.0 if index % 2 else 1.0) for index in range(6)])
+    filmed = [
+        to_uint8(np.clip(exposed[i, 0, 0] * picture / 255.0, 0, 1)) for i, picture in enumerate(pictures)
+    ]
+    seen = views(filmed)
+    formation = CaptureFormation(
+        seen, FormationConfig(enabled=False), exposure=Exposure(np.arange(6, dtype=np.int32), exposed)
+    )
+    still = CONFIG.model_copy(
+        update={
+            "densify": False,
+            "noise": 0.0,
+            "opacity_reg": 0.0,
+            "scale_reg": 0.0,
+            "coarse_share": 0.0,
+            "background": (0.0, 0.0, 0.0),
+        }
+    )
+    trained = run(seen, tmp_path, still, scene=Scene(gaussians()), formation=formation)
+    shown = [render(trained.scene.gaussians, view.camera).image.numpy() for view in seen]
+    truth = np.stack(pictures) / 255.0
+    lost = truth > 0.5  # the gain of 2 clips these
+    assert lost.mean() > 0.05
+    assert (truth - np.stack(shown))[lost].mean() < 0.01  # 0.002; 0.036 with a loss at clipped channels
+
+
+def test_a_saturated_channel_bounds_the_render_from_below() -> None:
+    target = torch.tensor([[[1.0, 1.0, 0.5], [254 / 255, 0.9, 0.0]]])
+    image = torch.tensor([[[1.3, 0.8, 0.7], [1.1, 1.2, 0.1]]])
+    image_recorded, clipped = recorded(image, target)
+    assert clipped.tolist() == [[[True, False, False], [True, False, False]]]
+    assert torch.equal(image_recorded, torch.where(clipped, target, image))
 
 
 def test_a_schedule_in_parts_equals_the_whole(pictures: list[np.ndarray], tmp_path: Path) -> None:
