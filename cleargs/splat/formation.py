@@ -73,8 +73,8 @@ SATURATED = 253 / 255
 def recorded(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Return a render as a sensor records it, and where it is brighter than a saturated photograph.
 
-    Both images are [H, W, 3] sRGB. The values there, per channel, become those of the photograph, since it
-    does not tell how bright they are. So a lamp does not get darker because one frame was overexposed.
+    Both images are [H, W, 3] sRGB. The values there, per channel, become those of the photograph, since a
+    saturated value is the same for all brighter light. So one overexposed frame does not darken a lamp.
     """
     too_bright = (target >= SATURATED) & (image > target)
     return torch.where(too_bright, target, image), too_bright
