@@ -458,8 +458,16 @@ def test_trust_is_earned() -> None:
 
 def test_a_frame_without_a_fault_earns_trust_by_its_misfit() -> None:
     """RVA gave soft close-ups of fur a tenth of the weight, and views near them lost 3 dB."""
-    known = {k: FrameFormation(k, misfit=0.010, misfit_still=0.010) for k in range(FRAMES)}
-    assert CaptureFormation(views(weights=[1.0, 1.0, 1.0, 1.0, 0.12]), LOOK, known=known).weight(4) == 1.0
+    known = {k: FrameFormation(k, misfit=0.010, misfit_still=0.010, draws=1) for k in range(FRAMES)}
+    seen = views(weights=[1.0, 1.0, 1.0, 1.0, 0.12])
+    formation = CaptureFormation(seen, LOOK, known=known)
+    assert formation.weight(4) == 1.0
+    target = torch.zeros(HEIGHT, WIDTH, 3)
+    # The training gets the weight, too. Frames whose weight is their own need nothing.
+    formed = formation.form(seen[4], 1.0, 0.9, target, None, lambda camera: pytest.fail("no estimate is due"))
+    assert formed is not None and formed.weight == 1.0 and not formed.needs_depth
+    plain = formation.form(seen[3], 1.0, 0.9, target, None, lambda camera: pytest.fail("no estimate is due"))
+    assert plain is None
 
 
 def test_the_table_gives_back_what_was_found(tmp_path: Path) -> None:
