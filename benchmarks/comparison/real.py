@@ -222,7 +222,8 @@ def real_table(listed: RealList, found: RealResults) -> str:
 def summary_table(listed: RealList, found: RealResults) -> str:
     """Return one row per scene, with the published figures of these scenes, as Markdown."""
     head = ["real capture", "all frames alike", "ClearGS", "processor minutes"]
-    rows, versions, absent = [], [], []
+    rows, absent = [], []
+    versions: dict[str, list[str]] = {}
     for scene in listed.scenes:
         stored = found.scenes.get(scene.name)
         if stored is None:
@@ -241,10 +242,12 @@ def summary_table(listed: RealList, found: RealResults) -> str:
             if one.scene == scene.name:
                 lpips = "-" if one.lpips is None else f"{one.lpips:.3f}"
                 rows.append([f"*{one.method}, on {one.scene}*", "", f"*{one.psnr:.2f} / {lpips}*", ""])
-        versions.append(f"{scene.name} {without_digest(stored.version)} ({_trainings(stored)})")
+        version = f"{without_digest(stored.version)} ({_trainings(stored)})"
+        versions.setdefault(version, []).append(scene.name)
+    made = "; ".join(f"{version} for {', '.join(names)}" for version, names in versions.items())
     line = (
         "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians; in brackets PSNR "
-        f"with refined test poses. Version {'; '.join(versions)}."
+        f"with refined test poses. Version {made}."
     )
     if absent:
         line += f" Still to be measured: {', '.join(absent)}."

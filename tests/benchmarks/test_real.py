@@ -101,7 +101,7 @@ def test_the_short_table_has_a_row_per_scene() -> None:
     (row,) = [line for line in table.splitlines() if line.startswith("| blurball")]
     assert row.endswith("| 29.00 / 0.200 (29.50) | 30.00 / 0.200 (30.50) | 2.0 and 2.0 |")
     assert "| *Deblur-NeRF, 200,000 iterations, on blurball* |  | *27.33 / 0.223* |  |" in table
-    assert "Version blurball 0.2.0, abc (mean of 2 trainings)." in table and "CoMoGaussian" not in table
+    assert "Version 0.2.0, abc (mean of 2 trainings) for blurball." in table and "CoMoGaussian" not in table
     assert "Still to be measured: kitchen, office, fox, terrace, bonsai." in table
 
 
