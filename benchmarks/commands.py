@@ -8,7 +8,7 @@ from benchmarks.comparison.compare_command import compare
 from benchmarks.comparison.evidence_command import evidence
 from benchmarks.comparison.real_command import real
 from benchmarks.comparison.world_command import world
-from benchmarks.poses import poses
+from benchmarks.poses_command import poses
 from benchmarks.rva.agree_command import agree
 from benchmarks.rva.check_command import check
 from benchmarks.speed.commands import formation, quality, splat, train

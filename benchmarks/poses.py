@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -58,28 +57,6 @@ FIGURES = (
 )
 """Residual at the given poses, errors of the kept-out matches (px; medians, then means up to 4), distances of
 the cameras from the true ones (medians, in the farthest camera's distance), and gain by the richer lens."""
-
-
-@click.command()
-@click.argument("captures", nargs=-1, type=click.Path(exists=True, path_type=Path))
-@click.option(
-    "-o", "--output", required=True, type=click.Path(path_type=Path), help="Folder of the captures."
-)
-@click.option(
-    "--seed", default=1, show_default=True, help="Seed of the rooms that are made without CAPTURES."
-)
-@click.option("--size", default=320, show_default=True, help="Long side of the images, px.")
-def poses(captures: Sequence[Path], output: Path, seed: int, size: int) -> None:
-    """Print how wrong poses of CAPTURES, or of synthetic rooms, are adjusted and found again.
-
-    A capture without poses is reconstructed first, and counts as true.
-    """
-    found = list(captures) or rooms(output, seed, size)
-    click.echo(",".join(("capture", "given", *FIGURES)))
-    for capture in found:
-        for row in measure(capture, output / f"{capture.name}.work", size):
-            texts = (f"{value:.4g}" if isinstance(value, float) else value for value in row.values())
-            click.echo(",".join(texts))
 
 
 def rooms(folder: Path, seed: int, size: int) -> list[Path]:

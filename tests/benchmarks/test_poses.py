@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from benchmarks import poses
+from benchmarks import poses, poses_command
 from cleargs.progress import SilentReporter
 from cleargs.synth.synthetic_capture import make_capture
 
@@ -20,7 +20,9 @@ def test_wrong_cameras_come_nearer_to_the_true_ones(tmp_path: Path, monkeypatch:
     )
     monkeypatch.setattr(poses, "GIVEN", {name: poses.GIVEN[name] for name in ("exact", "depth")})
     result = CliRunner().invoke(
-        poses.poses, [str(tmp_path / "room"), "-o", str(tmp_path), "--size", "240"], catch_exceptions=False
+        poses_command.poses,
+        [str(tmp_path / "room"), "-o", str(tmp_path), "--size", "240"],
+        catch_exceptions=False,
     )
     exact, depth = csv.DictReader(result.output.splitlines())
     assert (exact["capture"], exact["given"], depth["given"]) == ("room", "exact", "depth")
