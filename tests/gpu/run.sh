@@ -19,11 +19,19 @@
 set -uo pipefail
 cd "$(dirname "$0")/../.."
 out="$(mkdir -p "${1:?usage: tests/gpu/run.sh OUT [RUN]}" && cd "$1" && pwd)"
-run="${2:-}"
+run="${2:+$(realpath "$2")}"
 steps=" ${STEPS:-selftest tests agreement sanitizer bench g0} "
 python="${PYTHON:-python3}"
 unset TRITON_INTERPRET
-export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
+export PYTHONUNBUFFERED=1
+# Nothing needs to be installed: in links to the checkout, the folder `stages` is the package `cleargs.stages`.
+links="$(mktemp -d)"
+trap 'rm -rf "$links"' EXIT
+mkdir "$links/cleargs"
+ln -s "$PWD"/cleargs/* "$PWD/stages" "$PWD/workflows" "$links/cleargs"
+ln -s "$PWD"/{benchmarks,examples,pyproject.toml,stages,tests,tools} "$links"
+cd "$links"
+export PYTHONPATH="$links${PYTHONPATH:+:$PYTHONPATH}"
 failed=()
 
 wanted() { [[ "$steps" == *" $1 "* ]]; }

