@@ -298,6 +298,7 @@ class _Sfm:
                 break
             numbers = {found.image_id - 1 for found in model.images.values() if found.has_pose}
             before = {i for i in numbers if i < image - 1}
+            self._report(phase="checking a weak join", total=None)
             found = self._continued(model, database, min(before, numbers - before, key=len), _FIRST)
             again, better = weakest_join(found, database)
             if better <= share or not _names_in(found) >= _names_in(model):
