@@ -17,7 +17,7 @@ STEPS_PER_FRAME = 50
 MIN_STEPS, MAX_STEPS = 3200, 7200
 STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
 
-PIXELS_PER_GAUSSIAN = 50
+PIXELS_PER_GAUSSIAN = 30
 MIN_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
@@ -35,7 +35,7 @@ def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
 def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
     """Return the maximum number of Gaussians for a capture.
 
-    It is one Gaussian (59 numbers at SH degree 3) per 50 pixels (150 numbers, most seen by several frames),
+    It is one Gaussian (59 numbers at SH degree 3) per 30 pixels (90 numbers, most seen by several frames),
     times the factor of the quality. Fewer than 40,000 reduce the PSNR of small captures by 1 dB.
     ``max_budget`` is the upper limit at standard quality.
     """

@@ -27,7 +27,7 @@ def test_steps_follow_the_frames_within_bounds() -> None:
 
 
 def test_the_budget_follows_the_pixels_within_bounds() -> None:
-    found = [budget_from_pixels(pixels, 400_000) for pixels in (0, 24 * 540 * 960, 10**9, 10**10)]
+    found = [budget_from_pixels(pixels, 400_000) for pixels in (0, 12 * 540 * 960, 10**9, 10**10)]
     assert 0 < found[0] < found[1] < found[2] == found[3] == 400_000
     assert budget_from_pixels(0, 400_000, "draft") < found[0] < budget_from_pixels(0, 400_000, "high")
     bounded = [budget_from_pixels(10**9, 50_000, quality) for quality in get_args(Quality)]
