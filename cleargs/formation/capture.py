@@ -1,10 +1,11 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-The first look at a frame searches it, except in a draft. The next looks follow after every
-`FormationConfig.every` steps on it. They refine its motion with the scene of that time. A test of a few
-milliseconds (`pretest`) says if blur is left that nothing explains, and only then the frame is searched
-again. The sharper the scene becomes, the more blur the test finds. At the fourth look after the first one, at
-the eighth, and whenever their number has doubled, a path of a higher order is tried.
+The first look at a frame searches it, except in a draft, and in a capture that the frames before have shown to
+be sharp. The next looks follow after every `FormationConfig.every` steps on it. They refine its motion with the
+scene of that time. A test of a few milliseconds (`pretest`) says if blur is left that nothing explains, and
+only then the frame is searched again. The sharper the scene becomes, the more blur the test finds. At the
+fourth look after the first one, at the eighth, and whenever their number has doubled, a path of a higher order
+is tried.
 
 Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
 is searched at the first look of a training and at these looks, since the test cannot see a skew.
@@ -45,6 +46,9 @@ DOUBTED = 0.5
 AGAIN = 4
 """Looks at a frame from the first one to the next try of a higher order, and where the shutter rolls to the
 next search. After that their number doubles from one to the next: the scene changes less and less."""
+SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
+"""Share of frames with a model up to which a capture is sharp, and the fewest frames that tell. In a sharp
+capture a frame is not searched at its first look, unless the test finds blur."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
@@ -177,7 +181,7 @@ class CaptureFormation:
                 rolling=self._rolls(),
                 again=_searched_again(frame.draws // self._config.every),
                 test_rolling=frame_id in self._tested and frame.skew_gain is None,
-                draft=self._draft,
+                draft=self._draft or self._sharp(),
             )
 
         begun = progress >= self._config.start
@@ -256,6 +260,12 @@ class CaptureFormation:
 
     def _rolls(self) -> bool:
         return rolls(self._frames.values())
+
+    def _sharp(self) -> bool:
+        """Return True if few of the frames that were looked at so far needed a model."""
+        models = [frame.model for frame in self._frames.values() if frame.draws > 0]
+        modelled = len(models) - models.count("none")
+        return len(models) >= MIN_SEARCHED_FRAMES and modelled <= SHARP_SHARE * len(models)
 
 
 def _searched_again(looks: int) -> bool:

@@ -239,6 +239,22 @@ def test_a_draft_searches_only_frames_with_evidence(tmp_path: Path, searched: li
     assert len(searched) == 1
 
 
+@pytest.mark.parametrize(("modelled", "searches"), [(0, 1), (2, 2)])
+def test_a_sharp_capture_is_searched_only_where_there_is_evidence(
+    modelled: int, searches: int, tmp_path: Path, searched: list[FramePair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four frames were looked at. Two were not, of which one is blurred."""
+    monkeypatch.setattr("cleargs.formation.capture.MIN_SEARCHED_FRAMES", 4)
+    monkeypatch.setattr("cleargs.formation.capture.SHARP_SHARE", 1 / 4)
+    looked = known(**{f"f{k}": FrameMotion(blur=np.zeros(6)) for k in range(4, 4 + modelled)})
+    draws = {k: 0 if k in (0, BLURRED) else LOOK.every + 1 for k in looked}  # their next look is later
+    first = {k: replace(frame, draws=draws[k]) for k, frame in looked.items()}
+    formation = CaptureFormation(views(), LOOK, known=first)
+    run(tmp_path, views(), formation)
+    assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
+    assert len(searched) == searches
+
+
 def test_later_only_a_frame_with_evidence_is_searched(tmp_path: Path, searched: list[FramePair]) -> None:
     """After that its motion is followed."""
     formation = CaptureFormation(views(), LOOK, known=known())
