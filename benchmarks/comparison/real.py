@@ -32,8 +32,9 @@ SHOWCASE = "blurball"
 SHOWN = "001"
 """Stem of the blurred photograph of the picture, next to the first held-out view."""
 REFINE_STEPS = 15
-"""Steps of fitting each test pose for the second PSNR."""
-REFINED = "psnr_refined"
+"""Steps of fitting each test pose for the second figures."""
+REFINED = {"psnr": "psnr_refined", "lpips_alex": "lpips_alex_refined"}
+"""Names of the metrics with fitted test poses."""
 
 SHORT, FULL = "real", "real-full"
 """Names of the places for the two tables in a page."""
@@ -119,7 +120,7 @@ def run_scenes(
         reporter: Receives progress and warnings.
 
     Returns:
-        The results. PSNR with refined test poses is the metric `REFINED`. Missing captures and scenes are
+        The results. `REFINED` names the metrics with refined test poses. Missing captures and scenes are
         among the failures.
     """
     found = Comparison()
@@ -132,16 +133,15 @@ def run_scenes(
         own = replace(
             recipe, overrides=(*scene.settings, *recipe.overrides), steps=recipe.steps or scene.steps
         )
-        refined = replace(
-            own, options=own.options.model_copy(update={"refine_poses": REFINE_STEPS, "lpips": ()})
-        )
+        refined = replace(own, options=own.options.model_copy(update={"refine_poses": REFINE_STEPS}))
         samples = [Sample(place.absolute(), seed, None, scene.name) for seed in range(seeds)]
         made = make_scenes(out, samples, find_variants(variants), own, store, reporter)
         try:
             compared = compare_scenes(out, made, own, store, reporter)
             for number, finished in enumerate(compared.scenes):
                 (cell,) = evaluate_views(out, finished, refined, store, reporter)
-                means = compared.cells[number].means | {REFINED: cell.means["psnr"]}
+                again = {name: cell.means.get(metric) for metric, name in REFINED.items()}
+                means = compared.cells[number].means | again
                 compared.cells[number] = compared.cells[number].model_copy(update={"means": means})
         except CleargsError as error:
             found.failures.append(f"{scene.name}: {error}")
@@ -193,7 +193,8 @@ def read_results(path: Path) -> RealResults:
 def real_table(listed: RealList, found: RealResults) -> str:
     """Return all results and the published figures, with their conditions, as Markdown."""
     cells = found.cells
-    head = ["", "", "PSNR", "PSNR, test poses refined", "SSIM", "LPIPS (AlexNet)", "processor minutes"]
+    head = ["", "", "PSNR", "SSIM", "LPIPS (AlexNet)", "PSNR", "LPIPS", "processor minutes"]
+    head[5:7] = [f"{name}, test poses refined" for name in head[5:7]]
     rows, notes = [], []
     for scene in listed.scenes:
         stored = found.scenes.get(scene.name)
@@ -246,8 +247,8 @@ def summary_table(listed: RealList, found: RealResults) -> str:
         versions.setdefault(version, []).append(scene.name)
     made = "; ".join(f"{version} for {', '.join(names)}" for version, names in versions.items())
     line = (
-        "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians; in brackets PSNR "
-        f"with refined test poses. Version {made}."
+        "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians; in brackets with "
+        f"refined test poses. Version {made}."
     )
     if absent:
         line += f" Still to be measured: {', '.join(absent)}."
@@ -275,13 +276,16 @@ def _trainings(stored: StoredScene) -> str:
 
 
 def _short(cells: Cells, column: str, variant: str) -> str:
-    psnr, refined, lpips = (
-        cells.spread("held-out", column, variant, metric) for metric in ("psnr", REFINED, "lpips_alex")
-    )
-    if psnr is None:
+    def both(names: Sequence[str]) -> str | None:
+        psnr, lpips = (cells.spread("held-out", column, variant, name) for name in names)
+        if psnr is None:
+            return None
+        return f"{psnr.mean:.2f}" if lpips is None else f"{psnr.mean:.2f} / {lpips.mean:.3f}"
+
+    text, refined = both(list(REFINED)), both(list(REFINED.values()))
+    if text is None:
         return "-"
-    text = f"{psnr.mean:.2f} / {'-' if lpips is None else f'{lpips.mean:.3f}'}"
-    return f"{text} ({refined.mean:.2f})" if refined else text
+    return f"{text} ({refined})" if refined else text
 
 
 def _figures(cells: Cells, column: str, variant: str) -> list[str]:
@@ -291,7 +295,7 @@ def _figures(cells: Cells, column: str, variant: str) -> list[str]:
         more = f" ± {spread.deviation:.{digits}f}" if spread.deviation is not None else ""
         return f"{spread.mean:.{digits}f}{more}"
 
-    metrics = (("psnr", 2), (REFINED, 2), ("ssim", 3), ("lpips_alex", 3))
+    metrics = (("psnr", 2), ("ssim", 3), ("lpips_alex", 3), *zip(REFINED.values(), (2, 3), strict=True))
     return [
         *(text(cells.spread("held-out", column, variant, metric), digits) for metric, digits in metrics),
         _minutes(cells.of("held-out", column, variant)),
@@ -309,9 +313,8 @@ def _published(one: Published) -> list[str]:
         one.scene,
         f"*{one.method}*{' *' if one.second_hand else ''}",
         f"{one.psnr:.2f}",
-        "-",
         *figures,
-        "-",
+        *("-", "-", "-"),
     ]
 
 
