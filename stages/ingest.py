@@ -71,7 +71,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update=limits)
 
 
-VERSION = 12
+VERSION = 13
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}

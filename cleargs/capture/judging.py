@@ -19,6 +19,8 @@ from cleargs.capture.colmap import pycolmap
 
 HELD_OUT = 10
 """Every tenth track is kept out."""
+FIT_PX = 4.0
+"""Distance from its epipolar line up to which a match fits the poses, px (COLMAP verifies with the same)."""
 
 _WITH_MATRIX = (
     pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
@@ -108,6 +110,22 @@ def epipolar_errors(
         focal = 0.5 * (a.mean_focal_length() + b.mean_focal_length())
         found.append(np.where(np.isfinite(off), off * focal, np.inf))
     return np.concatenate(found)
+
+
+def fitting_shares(model: pycolmap.Reconstruction, matches: Matches) -> dict[int, float]:
+    """Return the share of each placed image's ``matches`` that are within `FIT_PX` of their epipolar lines.
+
+    A frame that wrong matches placed has a low share: its right matches contradict its pose.
+    """
+    poses = {key: image.cam_from_world().matrix() for key, image in model.images.items() if image.has_pose}
+    cameras = {key: model.cameras[model.images[key].camera_id] for key in poses}
+    counts, fitting = np.zeros((2, max(poses, default=0) + 1))
+    for pair, pixels in matches.items():
+        if poses.keys() >= set(pair):
+            errors = epipolar_errors({pair: pixels}, poses, cameras)
+            counts[list(pair)] += len(errors)
+            fitting[list(pair)] += (errors < FIT_PX).sum()
+    return {key: float(fitting[key] / counts[key]) for key in poses if counts[key]}
 
 
 def weakest_join(model: pycolmap.Reconstruction, database: Path) -> tuple[int, float]:

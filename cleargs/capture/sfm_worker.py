@@ -34,7 +34,7 @@ from cleargs.capture.database import (
     set_cameras,
     why_missing,
 )
-from cleargs.capture.judging import epipolar_errors, verified_matches, weakest_join
+from cleargs.capture.judging import epipolar_errors, fitting_shares, verified_matches, weakest_join
 from cleargs.capture.matching import loop_pairs, match_pairs, sequential_pairs
 from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
@@ -54,6 +54,10 @@ _NEARER = 0.9
 right, they are alike, and adjusted poses are in the user's world exactly."""
 _JOINED, _JOINS = 0.92, 3
 """Least share of the matches across a join whose features see one point, and most joins that are repeated
+(docs/experiments/poses.md)."""
+_MISPLACED, _PLACINGS, _FEW = 0.6, 2, 0.1
+"""Share of its matches that must fit a frame's pose, and how often frames with less are placed again. Then at
+most this share of all frames is left out: more say that the matches are wrong, not the poses
 (docs/experiments/poses.md)."""
 _FITS_PX, _FITS = 2.0, 0.5
 """Poses fit the images where at least this share of the matches is within this many pixels of its epipolar
@@ -282,8 +286,35 @@ class _Sfm:
 
     def _mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
         """Return the model of the images alone, and how frames were placed."""
-        model, placed = self._place_the_rest(self._rejoined(self._map(), self._database), pairs)
-        return self._rejoined(model, self._matched), placed
+        model = self._rejoined(self._corrected(self._map(), self._database), self._database)
+        model, placed = self._place_the_rest(model, pairs)
+        before = _names_in(model)
+        model = self._corrected(self._rejoined(model, self._matched), self._matched)
+        return model, placed | dict.fromkeys(before - _names_in(model), "its matches contradict its place")
+
+    def _corrected(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
+        """Return ``model`` after frames that contradict their matches were placed again, or left out.
+
+        A frame may be placed by wrong matches before the frames are there that share right ones with it.
+        """
+        matches = verified_matches(database)
+        shares = fitting_shares(model, matches)
+        for _ in range(_PLACINGS):
+            wrong = {image - 1 for image, share in shares.items() if share < _MISPLACED}
+            if not wrong:
+                break
+            self._report(phase="placing frames again", total=None)
+            found = self._continued(model, database, wrong, _FIRST)
+            better = fitting_shares(found, matches)
+            if len(better) < len(shares) or min(better.values()) <= min(shares.values()):
+                break
+            model, shares = found, better
+        contrary = [image for image, share in shares.items() if share < _MISPLACED]
+        if contrary and len(contrary) <= _FEW * len(shares):
+            model = copy.deepcopy(model)
+            for image in contrary:
+                model.deregister_frame(model.images[image].frame_id)
+        return model
 
     def _rejoined(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
         """Return ``model`` after the joins that contradict the matches across them were repeated.
@@ -377,7 +408,7 @@ class _Sfm:
         options.mapper.abs_pose_min_num_inliers = settings.inliers
         kept = copy.deepcopy(model)
         for image in model.images.values():
-            if image.image_id - 1 in again:
+            if image.image_id - 1 in again and image.has_pose:
                 kept.deregister_frame(image.frame_id)
         start = self._output / "start"
         make_folder(start, empty=True)
@@ -410,7 +441,7 @@ class _Sfm:
 
 
 def _names_in(model: pycolmap.Reconstruction) -> set[str]:
-    return {image.name for image in model.images.values()}
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-The first look at a frame searches it, except in a draft, and in a capture that the frames before have shown to
-be sharp. The next looks follow after every `FormationConfig.every` steps on it. They refine its motion with the
-scene of that time. A test of a few milliseconds (`pretest`) says if blur is left that nothing explains, and
-only then the frame is searched again. The sharper the scene becomes, the more blur the test finds. At the
-fourth look after the first one, at the eighth, and whenever their number has doubled, a path of a higher order
-is tried.
+The first look at a frame searches it, except in a draft, and in a capture that the frames before have
+shown to be sharp. The next looks follow after every `FormationConfig.every` steps on it. They refine its
+motion with the scene of that time. A test of a few milliseconds (`pretest`) says if blur is left that nothing
+explains, and only then the frame is searched again. The sharper the scene becomes, the more blur the test
+finds. At the fourth look after the first one, at the eighth, and whenever their number has doubled, a path of
+a higher order is tried.
 
 Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
 is searched at the first look of a training and at these looks, since the test cannot see a skew.

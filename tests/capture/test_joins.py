@@ -13,7 +13,7 @@ from cleargs.capture.adjustment import lay_over
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import CaptureConfig, SfmConfig
 from cleargs.capture.database import create_database
-from cleargs.capture.judging import weakest_join
+from cleargs.capture.judging import fitting_shares, verified_matches, weakest_join
 from cleargs.capture.model import SparseModel
 from cleargs.capture.prepare import prepare
 from cleargs.capture.sfm_job import Job, SfmOutcome
@@ -36,7 +36,9 @@ def with_first_part_scaled(poses: Poses, first: int, factor: float) -> Poses:
     return moved
 
 
-def test_a_part_at_another_scale_is_placed_again(images: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def placer(images: Path, tmp_path: Path) -> sfm_worker._Sfm:
+    """COLMAP's work on ten images, with matches."""
     work = tmp_path / "work"
     work.mkdir()
     frames = prepare(open_capture(images, CaptureConfig()), work, 320, SilentReporter())
@@ -47,24 +49,57 @@ def test_a_part_at_another_scale_is_placed_again(images: Path, tmp_path: Path) -
     placer._extract(placer._database, job.names, sfm_worker._FIRST)
     placer._match(placer._database, placer._pairs())
     placer._output.mkdir()
+    return placer
+
+
+def moved(placer: sfm_worker._Sfm, right: pycolmap.Reconstruction, poses: Poses) -> pycolmap.Reconstruction:
+    """Return ``right`` at other poses, with points of its own."""
+    model = pycolmap.Reconstruction(right)
+    for number, pose in poses.items():
+        model.frames[model.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
+    return placer._with_points(model, placer._database)
+
+
+def off(model: pycolmap.Reconstruction, right: pycolmap.Reconstruction) -> list[float]:
+    """Return how far the cameras are from the right ones, as shares of the extent of these."""
+    lay_over(model, right, list(model.images.values()))
+    centres = {number: image.projection_center() for number, image in right.images.items()}
+    size = np.ptp(list(centres.values()), axis=0).max()
+    return [
+        float(np.linalg.norm(image.projection_center() - centres[number]) / size)
+        for number, image in model.images.items()
+    ]
+
+
+def test_a_part_at_another_scale_is_placed_again(placer: sfm_worker._Sfm) -> None:
     right = placer._map()
     assert placer._rejoined(right, placer._database) is right
     poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}
-    torn = pycolmap.Reconstruction(right)
-    for number, pose in with_first_part_scaled(poses, 4, 4.0).items():
-        torn.frames[torn.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
-    torn = placer._with_points(torn, placer._database)
+    torn = moved(placer, right, with_first_part_scaled(poses, 4, 4.0))
     image, share = weakest_join(torn, placer._database)
     assert image == 4 and share < 0.6 and weakest_join(right, placer._database)[1] > 0.97
-    joined = placer._rejoined(torn, placer._database)
-    lay_over(joined, right, list(joined.images.values()))
-    off = [
-        np.linalg.norm(image.projection_center() - right.images[number].projection_center())
-        for number, image in joined.images.items()
-    ]
-    size = np.ptp([image.projection_center() for image in right.images.values()], axis=0).max()
+    found = off(placer._rejoined(torn, placer._database), right)
     # The torn one is off by half its extent. Two adjustments of the same matches differ by a few per mille.
-    assert len(off) == 10 and max(off) < 0.02 * size and placer._torn_at is None
+    assert len(found) == 10 and max(found) < 0.02 and placer._torn_at is None
+
+
+def test_a_frame_that_contradicts_its_matches_is_placed_again_or_left_out(
+    placer: sfm_worker._Sfm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = placer._map()
+    assert placer._corrected(right, placer._database) is right
+    poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}
+    away = poses[5].copy()
+    away[:, 3] += 0.5 * np.ptp([pose[:, 3] for pose in poses.values()], axis=0).max()
+    wrong = moved(placer, right, {5: away})
+    shares = fitting_shares(wrong, verified_matches(placer._database))
+    others = [share for number, share in shares.items() if number != 5]
+    assert shares[5] < 0.5 < 0.6 < min(others)  # measured: 0.1 and 0.8
+    found = off(placer._corrected(wrong, placer._database), right)
+    assert len(found) == 10 and max(found) < 0.02
+    monkeypatch.setattr(placer, "_continued", lambda model, *others: model)
+    left = placer._corrected(wrong, placer._database)
+    assert sfm_worker._names_in(right) - sfm_worker._names_in(left) == {right.images[5].name}
 
 
 def test_a_join_that_stays_wrong_is_named(
