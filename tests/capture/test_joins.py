@@ -53,7 +53,7 @@ def placer(images: Path, tmp_path: Path) -> sfm_worker._Sfm:
 
 
 def moved(placer: sfm_worker._Sfm, right: pycolmap.Reconstruction, poses: Poses) -> pycolmap.Reconstruction:
-    """Return ``right`` at other poses, with points of its own."""
+    """Return ``right`` at other poses, with its points triangulated there."""
     model = pycolmap.Reconstruction(right)
     for number, pose in poses.items():
         model.frames[model.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
