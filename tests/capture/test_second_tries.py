@@ -36,7 +36,9 @@ class Placer(sfm_worker._Sfm):
 
 
 def made(placed: set[int]) -> Any:
-    return SimpleNamespace(images={i: SimpleNamespace(name=NAMES[i], image_id=i + 1) for i in placed})
+    return SimpleNamespace(
+        images={i: SimpleNamespace(name=NAMES[i], image_id=i + 1, has_pose=True) for i in placed}
+    )
 
 
 @pytest.fixture(autouse=True)
