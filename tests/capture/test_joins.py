@@ -94,7 +94,7 @@ def test_a_frame_that_contradicts_its_matches_is_placed_again_or_left_out(
     wrong = moved(placer, right, {5: away})
     shares = fitting_shares(wrong, verified_matches(placer._database))
     others = [share for number, share in shares.items() if number != 5]
-    assert shares[5] < 0.5 < 0.6 < min(others)  # measured: 0.1 and 0.8
+    assert shares[5] < 0.5 < 0.6 < min(others)  # measured: 0.29 and 0.88
     found = off(placer._corrected(wrong, placer._database), right)
     assert len(found) == 10 and max(found) < 0.02
     monkeypatch.setattr(placer, "_continued", lambda model, *others: model)
