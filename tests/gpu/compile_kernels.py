@@ -20,6 +20,7 @@ from triton.compiler import ASTSource
 
 from cleargs.splat.kernels.cuda import (
     binning,
+    densify,
     elementwise,
     frame_warp,
     gradients,
@@ -62,6 +63,15 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                 **dict.fromkeys(("parameter", "gradient", "first", "second", "rates"), F32),
                 **{"size": "i32", "columns": "i32"},
                 **dict.fromkeys(("beta1", "beta2", "epsilon", "correction", "root_correction"), "fp32"),
+            },
+            {},
+            {},
+        ),
+        (
+            densify.add_noise,
+            {
+                **dict.fromkeys(("means", "log_scales", "rotations", "logits", "draws"), F32),
+                **{"amount": "fp32", "min_opacity": "fp32", "cut": "fp32", "n": "i32"},
             },
             {},
             {},

@@ -9,10 +9,22 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import triton
+import triton.language as tl
 from torch import Tensor
 
 from cleargs.splat import densification
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cuda import device_layout
+from cleargs.splat.kernels.cuda.device_layout import PROJECT_BLOCK
+from cleargs.splat.kernels.cuda.gradients import store_triple
+from cleargs.splat.kernels.cuda.projection import (
+    combine,
+    dot,
+    load_triple,
+    rotation_columns,
+    unit_quaternion,
+)
 from cleargs.splat.types import Moments
 
 
@@ -58,15 +70,36 @@ def refine(
     return Gaussians(**grown), Moments(*running)
 
 
+@triton.jit(do_not_specialize=["n"])
+def add_noise(means, log_scales, rotations, logits, draws, amount, min_opacity, cut, n):
+    """Add ``amount`` times the covariance times a normal vector, ``draws`` [N, 3], to the means [N, 3].
+
+    The noise fades out above ``min_opacity``. From the opacity ``cut`` on there is none.
+    """
+    g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
+    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + g, mask=g < n, other=0.0).to(tl.float64)))
+    some = (g < n) & (opacity < cut)
+    fade = amount / (1.0 + tl.exp(100.0 * (opacity - min_opacity)))
+    columns = rotation_columns(unit_quaternion(rotations, g, some))
+    scales, draw = load_triple(log_scales + g * 3, some), load_triple(draws + g * 3, some)
+    part0 = fade * tl.exp(2.0 * scales[0]) * dot(columns[0], draw)
+    part1 = fade * tl.exp(2.0 * scales[1]) * dot(columns[1], draw)
+    part2 = fade * tl.exp(2.0 * scales[2]) * dot(columns[2], draw)
+    mean = load_triple(means + g * 3, some)
+    moved = combine(part0, columns[0], part1, columns[1])
+    moved = combine(1.0, moved, part2, columns[2])
+    moved = combine(1.0, moved, 1.0, mean)
+    store_triple(means + g * 3, moved, some, some)
+
+
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
     """Add the noise of one step to the means of Gaussians below ``densification.NOISE_CUT``, in place."""
     generator = torch.Generator(gaussians.device).manual_seed(seed_of(seed))
-    opacity = gaussians.logit_opacities.sigmoid()
-    fade = amount / (1.0 + (100.0 * (opacity - min_opacity)).exp())
-    fade = torch.where(opacity < densification.NOISE_CUT, fade, 0.0)
-    axes = densification.rotation_matrices(gaussians.rotations, torch)
-    draw = torch.randn(gaussians.num, 3, generator=generator, device=gaussians.device)
-    local = (axes * draw[:, :, None]).sum(dim=1) * (2.0 * gaussians.log_scales).exp()  # S² Rᵀ draw
-    gaussians.means += fade[:, None] * (axes * local[:, None, :]).sum(dim=2)
+    draws = torch.randn(gaussians.num, 3, generator=generator, device=gaussians.device)
+    parameters = (gaussians.means, gaussians.log_scales, gaussians.rotations, gaussians.logit_opacities)
+    if gaussians.num:
+        add_noise[(-(-gaussians.num // PROJECT_BLOCK),)](
+            *parameters, draws, amount, min_opacity, densification.NOISE_CUT, gaussians.num, num_warps=4
+        )
