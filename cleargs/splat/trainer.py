@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -45,6 +46,10 @@ _NOTE_INTERVAL = 10
 
 _CHECK_INTERVAL = 10
 """Steps between checks for NaN and infinity (a check takes less than 1 ms for 50,000 Gaussians)."""
+
+_SHORT_SAVE, _SAVE_SHARE = 0.1, 0.05
+"""Seconds of a checkpoint that is always saved when it is due, and the share of the time that longer ones may
+take. On a GPU, 200 steps with 400,000 Gaussians take 2 s, and their checkpoint 0.4 s."""
 
 
 @dataclass(frozen=True)
@@ -153,11 +158,14 @@ class Trainer:
             reporter.task(label, total=self.length) as task,
         ):
             fractions, rate = self.work_fractions(), Rate()
+            next_save = 0.0
             while self.done < self.length:
                 self.step()
-                stopped = terminated()
+                stopped, now = terminated(), time.monotonic()
                 due = stopped or (
-                    self.done % self._config.checkpoint_interval == 0 and self.done < self.length
+                    self.done % self._config.checkpoint_interval == 0
+                    and self.done < self.length
+                    and now >= next_save
                 )
                 if self.done % _NOTE_INTERVAL == 0:
                     self._show(task, fractions, rate)
@@ -166,6 +174,7 @@ class Trainer:
                 if due:
                     save_state(checkpoint, self.state())
                     write_preview(checkpoint.with_name(PREVIEW), self.preview())
+                    next_save = _next_save(now, time.monotonic())
                 if stopped:
                     raise KeyboardInterrupt
             self.check_finite()
@@ -393,6 +402,12 @@ class Trainer:
             f"{fault} at step {self.done}; the last good checkpoint is kept",
             hint="lower the rates (lr_scales, lr_means), or use another --seed",
         )
+
+
+def _next_save(begun: float, ended: float) -> float:
+    """Return the time of the earliest next checkpoint after one that took from ``begun`` to ``ended``, s."""
+    seconds = ended - begun
+    return ended if seconds <= _SHORT_SAVE else ended + seconds * (1.0 / _SAVE_SHARE - 1.0)
 
 
 def _fingerprint(

@@ -19,9 +19,17 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.observed import Fit, evaluate_views, pooled_unseen, render_observed
+from cleargs.formation.observed import (
+    MAX_EVALUATED,
+    Fit,
+    evaluate_views,
+    evaluated,
+    pooled_unseen,
+    render_observed,
+)
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
+from cleargs.splat import trainer as trainer_module
 from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.formation import recorded
@@ -433,6 +441,15 @@ def test_unseen_pixels_measure_quality_without_training(pictures: list[np.ndarra
     assert pooled_unseen([Fit(20.0, None)]) is None
 
 
+def test_the_evaluated_frames_are_spread_over_the_capture(pictures: list[np.ndarray]) -> None:
+    many = [replace(views(pictures)[0], frame_id=number) for number in range(150)]
+    numbers = [view.frame_id for view in evaluated(many)]
+    assert len(numbers) == MAX_EVALUATED
+    assert {b - a for a, b in pairwise([-2, *numbers, 152])} <= {4, 5}  # 150 / 32 = 4.7
+    assert evaluated(many[:7]) == many[:7]
+    assert evaluated([]) == []
+
+
 def test_one_percent_of_each_frame_is_unseen() -> None:
     masks = [unseen_pixels(frame_id, 540, 960) for frame_id in range(20)]
     assert {int(mask.sum()) for mask in masks} == {12 * 7 * 64}
@@ -534,6 +551,28 @@ def test_previews_change_no_bit(
 
     monkeypatch.setattr(Trainer, "preview", lambda trainer: torch.zeros(2, 2, 3))
     assert_same(with_previews, run(weighted, tmp_path / "b"))
+
+
+def test_slow_checkpoints_become_rare(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With steps of 0.5 s and checkpoints of 1 s, 5 % of the time allow one checkpoint in about 40 steps."""
+    clock, saved = [0.0], []
+    step = Trainer.step
+
+    def slow_step(trainer: Trainer) -> None:
+        clock[0] += 0.5
+        step(trainer)
+
+    def slow_save(path: Path, state: dict[str, Any]) -> None:
+        clock[0] += 1.0
+        saved.append(int(state["step"]))
+
+    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(trainer_module, "save_state", slow_save)
+    monkeypatch.setattr(Trainer, "step", slow_step)
+    run(pictures, tmp_path, CONFIG.model_copy(update={"steps": 100, "checkpoint_interval": 10}))
+    assert saved == [10, 50, 90]
 
 
 def test_relocation_does_not_hide_nan(
