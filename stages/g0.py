@@ -56,7 +56,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 34
+VERSION = 35
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -108,7 +108,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.exposure import Exposure, write_exposure
     from cleargs.formation.frames import real_views
     from cleargs.formation.movement import TOLERANCE, write_movement
-    from cleargs.formation.observed import evaluate_views, pooled_unseen
+    from cleargs.formation.observed import evaluate_views, evaluated, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -162,7 +162,8 @@ def run(context: StageContext[G0Config]) -> StageResult:
     trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
     learned = formation.exposure or Exposure.identity([view.frame_id for view in views])
     moving = formation.moving
-    fits = evaluate_views(trained.scene.to(context.device), views, learned, formation.frames, moving=moving)
+    few = evaluated(views)
+    fits = evaluate_views(trained.scene.to(context.device), few, learned, formation.frames, moving=moving)
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
     write_exposure(context.out / "exposure.parquet", learned)
@@ -171,7 +172,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     write_movement(context.out / "movement.parquet", moving)
     save_state(context.out / "state.safetensors", trained.state)
 
-    psnr = {view.frame_id: fit.psnr for view, fit in zip(views, fits, strict=True)}
+    psnr = {view.frame_id: fit.psnr for view, fit in zip(few, fits, strict=True)}
     strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
     return StageResult(
         summary={

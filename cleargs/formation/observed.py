@@ -118,6 +118,11 @@ def render_observed(
     return formed.forward(render).clamp(0.0, 1.0)
 
 
+MAX_EVALUATED = 32
+"""Most frames on which a stage compares its scene with the photographs. Each takes as long as a training
+step."""
+
+
 class Fit(NamedTuple):
     """PSNR of a scene on one view, dB, over the pixels that count."""
 
@@ -134,6 +139,12 @@ def pooled_unseen(fits: Iterable[Fit]) -> float | None:
     errors = [10.0 ** (-0.1 * fit.unseen) for fit in fits if fit.unseen is not None]
     error = math.fsum(errors) / len(errors) if errors else 0.0
     return -10.0 * math.log10(error) if error > 0.0 else None
+
+
+def evaluated(views: Sequence[TrainingView]) -> list[TrainingView]:
+    """Return the views on which a stage compares its scene: `MAX_EVALUATED` at most, evenly spread."""
+    count = min(len(views), MAX_EVALUATED)
+    return [views[(2 * k + 1) * len(views) // (2 * count)] for k in range(count)]
 
 
 def evaluate_views(

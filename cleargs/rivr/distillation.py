@@ -21,7 +21,13 @@ from cleargs.formation.deblur import deblur
 from cleargs.formation.exposure import apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, fit_motion
 from cleargs.formation.movement import TOLERANCE, read_movement, still_pixels, write_movement
-from cleargs.formation.observed import FormedView, evaluate_views, pooled_unseen, render_observed
+from cleargs.formation.observed import (
+    FormedView,
+    evaluate_views,
+    evaluated,
+    pooled_unseen,
+    render_observed,
+)
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
@@ -105,12 +111,15 @@ class TrainedScene:
         return render_observed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
     def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
-        """Return the PSNR, dB, of the pixels of ``views`` that no training saw; None where there are none."""
-        return pooled_unseen(
-            evaluate_views(
-                self.scene, views, self.exposure, self.formations, moving=self.moving, engine=self._engine
-            )
+        """Return the PSNR, dB, of the pixels that no training saw; None where there are none.
+
+        Those of ``views`` that are `evaluated` count.
+        """
+        few, engine = evaluated(views), self._engine
+        fits = evaluate_views(
+            self.scene, few, self.exposure, self.formations, moving=self.moving, engine=engine
         )
+        return pooled_unseen(fits)
 
     def still(self, view: TrainingView, mask: MaskBool | None) -> MaskBool | None:
         """Return the pixels of ``mask`` in which nothing moves; None: all."""
