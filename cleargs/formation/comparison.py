@@ -148,9 +148,9 @@ class Level:
         return flow_basis(widened(self._pair.camera, self._pair.margin), self.nearness)
 
     @cached_property
-    def _planes(self) -> ArrayF32:
-        slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
-        return np.ascontiguousarray(np.stack([self._image, *slopes]), np.float32)
+    def _smooth(self) -> ArrayF32:
+        """The image whose slopes a fit follows, smoothed by [1 2 1] / 4 along both axes."""
+        return np.asarray(cv2.GaussianBlur(self._image, (3, 3), 0.0), np.float32)
 
     @cached_property
     def _nowhere(self) -> ArrayF32:
@@ -185,10 +185,7 @@ class Level:
         """Return offset, sweep, radius and, where ``curved``, curve: see `DisplacementFields`."""
 
         def flow(twist: ArrayF64) -> ArrayF32:
-            if not twist.any():
-                return self._nowhere
-            # einsum, for its fixed order of summation.
-            return np.asarray(np.einsum("n,nchw->chw", twist.astype(np.float32), self._basis))
+            return cpu.flow(self._basis, twist) if twist.any() else self._nowhere
 
         offset = flow(motion.pose)
         if motion.skew.any():
@@ -205,7 +202,8 @@ class Level:
         curved = bool((active >= BEND.start).any()) or motion.order > 1
         offset, sweep, _, curve = self.fields(motion, curved)
         return cpu.normal_equations(
-            self._planes,
+            self._image,
+            self._smooth,
             self._observed,
             self._fitting,
             self._basis,

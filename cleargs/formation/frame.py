@@ -27,6 +27,8 @@ from cleargs.splat.types import Render
 EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
 """Share of the squared error on unseen tiles that further blur must explain before a frame is searched; the
 second holds for frames that RVA doubts. Both are from tuning captures (docs/experiments/formation.md)."""
+NEWS = 1.25
+"""Factor by which that share must have grown since the last search before a frame is searched again."""
 SEARCHED_SHARE = 0.05
 """Margin of a search, as a share of the longer side."""
 
@@ -62,6 +64,8 @@ class FrameFormation:
     skew_gain: float | None = None
     """Share of the misfit that a rolling shutter explains beyond blur and defocus, by the last search; None
     where none was made."""
+    evidence: float = 0.0
+    """Least share of the squared error that further blur explained since the last search."""
     draws: int = 0
     """Steps on the frame since the first estimate of its formation."""
 
@@ -98,8 +102,8 @@ def fit_motion(
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
     The first time, the frame is searched. Later a known formation is refined, and the frame is searched only
-    if the test of `pretest` finds blur that the present model does not explain, or if a rolling shutter is
-    asked for, since the test cannot see a skew.
+    if the test of `pretest` finds blur that the present model does not explain and that the last search did
+    not leave, or if a rolling shutter is asked for, since the test cannot see a skew.
 
     Args:
         frame: The formation so far. Its model remains a candidate.
@@ -133,7 +137,8 @@ def fit_motion(
     # A descent with many unknowns that began in a soft scene can end in a wrong path and stay there.
     again = again and (rolling or followed.motion.order > 1)
     asked = first or untested or test_rolling or again or not _admitted(frame.model, rolling)
-    enough = DOUBTED_EVIDENCE if doubted else EVIDENCE
+    enough = max(DOUBTED_EVIDENCE if doubted else EVIDENCE, NEWS * frame.evidence)
+    left = min(frame.evidence, evidence.gain)
     if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
         if wide > margin:
@@ -153,7 +158,8 @@ def fit_motion(
             found += refine(pair, followed.model, followed.motion, pose=pose)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
         best = _accepted(best, found[0], frame.model, config)
-    return _described(frame, best, factor, camera, rendered, margin)
+        left = _unexplained(pair, rendered, best).gain
+    return _described(replace(frame, evidence=left), best, factor, camera, rendered, margin)
 
 
 def _accepted(best: MotionFit, still: MotionFit, before: Model, config: FormationConfig) -> MotionFit:
@@ -183,8 +189,13 @@ def _admitted(model: Model, rolling: bool) -> bool:
 
 
 def _skew_gain(found: list[MotionFit]) -> float:
-    """Return the share of the misfit that remains without a skew and is gone with one."""
+    """Return the share of the misfit that remains without a skew and is gone with one.
+
+    It is 0 up to twice the error of rounding, which any further motion fits in part.
+    """
     still = preferred([e for e in found if _admitted(e.model, rolling=False)])
+    if still.misfit <= 2.0 * MIN_MISFIT:
+        return 0.0
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
     return max(0.0, explained_share(rolled.misfit, still.misfit))
 
@@ -220,6 +231,7 @@ def _described(
             misfit=best.misfit,
             misfit_still=best.misfit_still,
             skew_gain=frame.skew_gain,
+            evidence=frame.evidence,
             draws=frame.draws,
         )
     motion = _scaled(best.motion, 1.0 / factor)
@@ -245,10 +257,12 @@ def _described(
 
 def reach_of(fields: DisplacementFields) -> float:
     """Return the reach of the pixels, px: see `FrameFormation.reach_px`."""
-    displacements = fields.offset.abs() + 0.5 * fields.sweep.abs() + fields.radius
+    few = (..., slice(None, None, 4), slice(None, None, 4))
+    displacements = fields.offset[few].abs() + 0.5 * fields.sweep[few].abs() + fields.radius[few]
     if fields.curve is not None:
-        displacements += BEND_REACH * fields.curve[:2].abs() + CUBE_REACH * fields.curve[2:].abs()
-    return float(np.quantile(displacements.amax(dim=0)[::4, ::4].cpu().numpy(), 0.95))
+        curve = fields.curve[few].abs()
+        displacements += BEND_REACH * curve[:2] + CUBE_REACH * curve[2:]
+    return float(np.quantile(displacements.amax(dim=0).cpu().numpy(), 0.95))
 
 
 def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
@@ -266,7 +280,7 @@ def margin_for(reach: float, camera: Camera) -> int:
 def as_row(frame: FrameFormation) -> dict[str, Any]:
     """Return the numbers of the frame by their names in ``formation.parquet``."""
     motion = frame.motion
-    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws")}
+    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws", "evidence")}
     for name in TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
     row |= {name: getattr(motion, name) for name in LENS} | {"order": motion.order}
@@ -274,12 +288,13 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame of which `as_row` gave this row; an older table has no ``draws`` and no curves."""
+    """Return the frame of which `as_row` gave this row; an older table lacks ``draws``, curves, ``evidence``."""
     vector = np.array([row.get(f"{name}_{axis}") or 0.0 for name in TWISTS for axis in AXES])
     return FrameFormation(
         row["frame_id"],
         FrameMotion(**{name: row[name] for name in LENS}).with_vector(vector),
         row["model"],
+        evidence=row.get("evidence") or 0.0,
         draws=row.get("draws") or 0,
         **{name: row[name] for name in (*MEASURED, "skew_gain")},
     )

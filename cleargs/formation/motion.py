@@ -99,11 +99,15 @@ def flow_basis(
     column = (np.arange(width) + 0.5) * camera.width / width
     row = (np.arange(height) + 0.5) * camera.height / height
     x, y = np.meshgrid((column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy)
-    none = np.zeros_like(x)
-    along_x = np.stack([-nearness, none, x * nearness, x * y, -(1 + x * x), y])
-    along_y = np.stack([none, -nearness, y * nearness, 1 + y * y, -x * y, -x]) * (camera.fy / camera.fx)
-    scales = width / camera.width, height / camera.height
-    return np.stack([scales[0] * along_x, scales[1] * along_y], axis=1).astype(np.float32)
+    along_x = -nearness, None, x * nearness, x * y, -(1 + x * x), y
+    along_y = None, -nearness, y * nearness, 1 + y * y, -x * y, -x
+    scales = width / camera.width, height / camera.height * (camera.fy / camera.fx)
+    basis = np.zeros((TWIST, 2, height, width), np.float32)
+    for k, components in enumerate(zip(along_x, along_y, strict=True)):
+        for axis, component in enumerate(components):
+            if component is not None:
+                basis[k, axis] = scales[axis] * component
+    return basis
 
 
 def pixel_paths(

@@ -47,6 +47,12 @@ FORMATION = pa.schema(
             "share of the misfit that a rolling shutter explains beyond blur and defocus",
             nullable=True,
         ),
+        column(
+            "evidence",
+            pa.float64(),
+            "least share of the squared error that further blur explained since the last search",
+            nullable=True,
+        ),
         column("weight_before", pa.float64(), "RVA's weight of the frame"),
         column("weight_after", pa.float64(), "with which it taught at the end"),
         *(_component(name, axis) for name in TWISTS for axis in AXES),

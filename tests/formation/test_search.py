@@ -211,7 +211,6 @@ def test_the_equations_have_the_slopes_of_the_misfit() -> None:
     )
     down = (np.arange(HEIGHT, dtype=np.float32) + 0.5) / HEIGHT - np.float32(0.5)
     basis = flow_basis(CAMERA, (MEDIAN / wall()).astype(np.float32))
-    planes = np.stack([seen, *np.gradient(seen)[::-1]]).astype(np.float32)
     weight = np.zeros_like(seen)
     weight[30:-30, 30:-30] = 1.0
     observed = np.roll(seen, 3, axis=1)
@@ -236,7 +235,7 @@ def test_the_equations_have_the_slopes_of_the_misfit() -> None:
 
     offset, sweep, curve = fields(vector)
     _, side = cpu.normal_equations(
-        planes, observed, weight, basis, down, offset, sweep, curve, times, 1e9, np.arange(30)
+        seen, seen, observed, weight, basis, down, offset, sweep, curve, times, 1e9, np.arange(30)
     )
     slopes = []
     for step in 0.25 * np.eye(30):

@@ -263,6 +263,14 @@ def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
 # -- search for the motion -----------------------------------------------------------------------------------
 
 
+def flow(basis: ArrayF32, twist: npt.NDArray[np.float64]) -> ArrayF32:
+    """Return the image motion [2, H, W], px, of a ``twist`` [6]: see `frame_search.flow`."""
+    out = np.empty(basis.shape[1:], np.float32)
+    with LAUNCHING:
+        frame_search.flow(basis, twist.astype(np.float32), out)
+    return out
+
+
 def misfit(
     image: ArrayF32,  # [H, W]
     observed: ArrayF32,  # [H, W]
@@ -282,7 +290,8 @@ def misfit(
 
 
 def normal_equations(
-    planes: ArrayF32,  # [3, H, W]
+    image: ArrayF32,  # [H, W]
+    smooth: ArrayF32,  # [H, W]
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
     basis: ArrayF32,  # [6, 2, H, W]
@@ -299,7 +308,8 @@ def normal_equations(
     matrices, sides = np.empty((height, count, count)), np.empty((height, count))
     with LAUNCHING:
         frame_search.normal_equations(
-            planes,
+            image,
+            smooth,
             observed,
             weight,
             basis,
@@ -385,9 +395,7 @@ def _warm_up_formation() -> None:
         offset, sweep, radius, curve = _arrays(fields)
         misfit(pixels, pixels, pixels, (offset, sweep, radius, curve), np.zeros((1, 3), np.float32), 1.0)
         normal_equations(
-            np.zeros((3, SIZE, SIZE), np.float32),
-            pixels,
-            pixels,
+            *(pixels, pixels, pixels, pixels),
             np.zeros((6, 2, SIZE, SIZE), np.float32),
             np.zeros(SIZE, np.float32),
             offset,
@@ -397,4 +405,5 @@ def _warm_up_formation() -> None:
             1.0,
             np.arange(6),
         )
+    flow(np.zeros((6, 2, SIZE, SIZE), np.float32), np.zeros(6))
     blur_sums(pixels, pixels, pixels, 2, 4)

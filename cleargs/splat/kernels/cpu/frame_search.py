@@ -26,6 +26,23 @@ def _mixed(plane: Any, i: Any, j: Any, a: Any, b: Any) -> Any:
 
 
 @kernel
+def flow(
+    basis: ArrayF32,  # [6, 2, H, W]: image motion per component of a twist, px
+    twist: ArrayF32,  # [6]
+    out: ArrayF32,  # [2, H, W], written
+) -> None:
+    """Write the image motion of a twist, px."""
+    _, _, height, width = basis.shape
+    for y in prange(height):
+        for axis in range(2):
+            for x in range(width):
+                total = np.float32(0)
+                for n in range(6):
+                    total += twist[n] * basis[n, axis, y, x]
+                out[axis, y, x] = total
+
+
+@kernel
 def misfits(
     image: ArrayF32,  # [H, W]
     observed: ArrayF32,  # [H, W]
@@ -81,7 +98,8 @@ def misfits(
 
 @kernel
 def normal_equations(
-    planes: ArrayF32,  # [3, H, W]: image, its derivatives by x and y
+    image: ArrayF32,  # [H, W]
+    smooth: ArrayF32,  # [H, W]: the image without its noise, which has the slopes
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
     basis: ArrayF32,  # [6, 2, H, W]: image motion per component of a twist, px
@@ -132,8 +150,11 @@ def normal_equations(
                     at_y += second * bent[1, p] + third * bent[3, p]
                 i, a = between(at_x, right)
                 j, b = between(at_y, bottom)
-                sums[0, p] += _mixed(planes[0], i, j, a, b)
-                slope_x, slope_y = _mixed(planes[1], i, j, a, b), _mixed(planes[2], i, j, a, b)
+                sums[0, p] += _mixed(image, i, j, a, b)
+                above = smooth[j, i + 1] - smooth[j, i]
+                below = smooth[j + 1, i + 1] - smooth[j + 1, i]
+                slope_x = above + b * (below - above)
+                slope_y = smooth[j + 1, i] - smooth[j, i] + a * (below - above)
                 sums[1, p] += slope_x
                 sums[2, p] += slope_y
                 sums[3, p] += t * slope_x
