@@ -288,7 +288,7 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame of which `as_row` gave this row; an older table lacks ``draws``, curves, ``evidence``."""
+    """Return the frame whose `as_row` this is. Older tables lack ``draws``, curves and ``evidence``."""
     vector = np.array([row.get(f"{name}_{axis}") or 0.0 for name in TWISTS for axis in AXES])
     return FrameFormation(
         row["frame_id"],

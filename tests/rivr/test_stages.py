@@ -180,7 +180,7 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
         deblurred = from_layer(exr.layers["deblurred"])
         np.testing.assert_allclose(from_layer(exr.layers["restored"]), expert.restore(deblurred), atol=4e-3)
     # Frames of low quality are means over seven pixels along the rows. In frames as small as these a search
-    # also finds a few pixels in a sharp one. How many depends on rounding: 1 to 4 px were seen.
+    # also finds a few pixels in a sharp one. The number depends on rounding: 1 to 4 px were seen.
     weak = [blur[1, k] for k in TARGETS if ROLES[k] != "strong"]
     strong = [blur[1, k] for k in TARGETS if ROLES[k] == "strong"]
     assert min(weak) > 3.0
