@@ -264,6 +264,18 @@ def test_later_only_a_frame_with_evidence_is_searched(tmp_path: Path, searched: 
     assert len(searched) == 1
 
 
+def test_blur_that_the_last_search_left_is_not_searched_again(
+    tmp_path: Path, searched: list[FramePair]
+) -> None:
+    """It explains most of the error of the frame, as it did after that search."""
+    first = known()
+    first[BLURRED] = replace(first[BLURRED], evidence=1.0)
+    formation = CaptureFormation(views(), LOOK, known=first)
+    run(tmp_path, views(), formation)
+    assert not searched
+    assert 0.0 < formation.frames[BLURRED].evidence < 1.0  # what is left now
+
+
 def test_what_is_known_is_not_searched_again(tmp_path: Path, searched: list[FramePair]) -> None:
     formation = CaptureFormation(views(), LOOK, known=known(f2=BLUR))
     run(tmp_path, views(), formation)
