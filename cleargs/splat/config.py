@@ -176,7 +176,7 @@ class TrainConfig(Settings):
     checkpoint_interval: int = Field(
         200,
         ge=1,
-        description="steps between checkpoints; does not change results",
+        description="least steps between checkpoints; does not change results",
         json_schema_extra={"key": False},
     )
     cache_mb: int = Field(

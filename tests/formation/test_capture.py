@@ -273,7 +273,7 @@ def test_blur_that_the_last_search_left_is_not_searched_again(
     formation = CaptureFormation(views(), LOOK, known=first)
     run(tmp_path, views(), formation)
     assert not searched
-    assert 0.0 < formation.frames[BLURRED].evidence < 1.0  # what is left now
+    assert 0.0 < formation.frames[BLURRED].evidence < 1.0  # the share that is left
 
 
 def test_what_is_known_is_not_searched_again(tmp_path: Path, searched: list[FramePair]) -> None:
