@@ -27,7 +27,7 @@ from cleargs.splat.types import Render
 EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
 """Share of the squared error on unseen tiles that further blur must explain before a frame is searched; the
 second holds for frames that RVA doubts. Both are from tuning captures (docs/experiments/formation.md)."""
-NEWS = 1.25
+GROWN_EVIDENCE = 1.25
 """Factor by which that share must have grown since the last search before a frame is searched again."""
 SEARCHED_SHARE = 0.05
 """Margin of a search, as a share of the longer side."""
@@ -137,7 +137,7 @@ def fit_motion(
     # A descent with many unknowns that began in a soft scene can end in a wrong path and stay there.
     again = again and (rolling or followed.motion.order > 1)
     asked = first or untested or test_rolling or again or not _admitted(frame.model, rolling)
-    enough = max(DOUBTED_EVIDENCE if doubted else EVIDENCE, NEWS * frame.evidence)
+    enough = max(DOUBTED_EVIDENCE if doubted else EVIDENCE, GROWN_EVIDENCE * frame.evidence)
     left = min(frame.evidence, evidence.gain)
     if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
@@ -189,13 +189,8 @@ def _admitted(model: Model, rolling: bool) -> bool:
 
 
 def _skew_gain(found: list[MotionFit]) -> float:
-    """Return the share of the misfit that remains without a skew and is gone with one.
-
-    It is 0 up to twice the error of rounding, which any further motion fits in part.
-    """
+    """Return the share of the misfit that remains without a skew and is gone with one."""
     still = preferred([e for e in found if _admitted(e.model, rolling=False)])
-    if still.misfit <= 2.0 * MIN_MISFIT:
-        return 0.0
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
     return max(0.0, explained_share(rolled.misfit, still.misfit))
 
