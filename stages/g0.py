@@ -56,7 +56,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 36
+VERSION = 37
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -103,12 +103,13 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
 
 def run(context: StageContext[G0Config]) -> StageResult:
     """Make Gaussians of the sparse points and train them on the active frames with their RVA weights."""
+    from cleargs.capture.folders import spread
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
     from cleargs.formation.frames import real_views
     from cleargs.formation.movement import TOLERANCE, write_movement
-    from cleargs.formation.observed import evaluate_views, evaluated, pooled_unseen
+    from cleargs.formation.observed import MAX_EVALUATED, evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -141,7 +142,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
         seed=context.seed,
         say=lambda remark: context.reporter.info(f"G0: {remark}"),
     )
-    exposure, spread = _exposure(config, views, sparse)
+    exposure, exposure_spread = _exposure(config, views, sparse)
     formation = CaptureFormation(
         views,
         config.formation,
@@ -162,7 +163,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
     learned = formation.exposure or Exposure.identity([view.frame_id for view in views])
     moving = formation.moving
-    few = evaluated(views)
+    few = spread(views, MAX_EVALUATED)
     fits = evaluate_views(trained.scene.to(context.device), few, learned, formation.frames, moving=moving)
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
@@ -182,7 +183,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "steps": config.length,
             "sh_degree": gaussians.sh_degree,
             "exposure": exposure is not None,
-            "exposure_spread": spread,
+            "exposure_spread": exposure_spread,
             "moving_share": sum(float(cells.mean()) for cells in moving.values()) / len(views),
             "psnr_strong": _mean([psnr[frame_id] for frame_id in strong if frame_id in psnr]),
             "psnr_active": _mean(list(psnr.values())),

@@ -119,8 +119,7 @@ def render_observed(
 
 
 MAX_EVALUATED = 32
-"""Most frames on which a stage compares its scene with the photographs. Each takes as long as a training
-step."""
+"""Most frames, evenly over the capture, on which a stage compares its scene with the photographs."""
 
 
 class Fit(NamedTuple):
@@ -139,12 +138,6 @@ def pooled_unseen(fits: Iterable[Fit]) -> float | None:
     errors = [10.0 ** (-0.1 * fit.unseen) for fit in fits if fit.unseen is not None]
     error = math.fsum(errors) / len(errors) if errors else 0.0
     return -10.0 * math.log10(error) if error > 0.0 else None
-
-
-def evaluated(views: Sequence[TrainingView]) -> list[TrainingView]:
-    """Return the views on which a stage compares its scene: `MAX_EVALUATED` at most, evenly spread."""
-    count = min(len(views), MAX_EVALUATED)
-    return [views[(2 * k + 1) * len(views) // (2 * count)] for k in range(count)]
 
 
 def evaluate_views(

@@ -15,6 +15,7 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
+from cleargs.capture.folders import spread
 from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.deblur import deblur
@@ -22,9 +23,9 @@ from cleargs.formation.exposure import apply_affine, read_exposure, write_exposu
 from cleargs.formation.frame import FrameFormation, fit_motion
 from cleargs.formation.movement import TOLERANCE, read_movement, still_pixels, write_movement
 from cleargs.formation.observed import (
+    MAX_EVALUATED,
     FormedView,
     evaluate_views,
-    evaluated,
     pooled_unseen,
     render_observed,
 )
@@ -113,9 +114,9 @@ class TrainedScene:
     def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
         """Return the PSNR, dB, of the pixels that no training saw; None where there are none.
 
-        Those of ``views`` that are `evaluated` count.
+        `MAX_EVALUATED` of ``views`` count at most.
         """
-        few, engine = evaluated(views), self._engine
+        few, engine = spread(views, MAX_EVALUATED), self._engine
         fits = evaluate_views(
             self.scene, few, self.exposure, self.formations, moving=self.moving, engine=engine
         )

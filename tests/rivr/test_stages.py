@@ -34,6 +34,7 @@ from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.movement import write_movement
+from cleargs.formation.observed import Fit, evaluate_views
 from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.progress import SilentReporter
@@ -51,6 +52,7 @@ from cleargs.rivr.tables import (
 )
 from cleargs.rivr.targets import load_supervision
 from cleargs.splat.config import FormationConfig
+from cleargs.splat.scene import Scene
 from cleargs.splat.views import TrainingView
 from cleargs.stages import consolidate, rivr
 
@@ -268,6 +270,21 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
     np.testing.assert_array_equal(whole["explained"], explained.image)
     assert {image.shape for image in half.values()} == {(HEIGHT // 2, WIDTH // 2, 3)}
     assert scene.formed_layers(supervision.views[0]) == {}
+
+
+def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[int] = []
+
+    def recorded(scene: Scene, views: list[TrainingView], *rest: Any, **options: Any) -> list[Fit]:
+        compared.extend(view.frame_id for view in views)
+        return evaluate_views(scene, views, *rest, **options)
+
+    monkeypatch.setattr("cleargs.rivr.distillation.MAX_EVALUATED", 3)
+    monkeypatch.setattr("cleargs.rivr.distillation.evaluate_views", recorded)
+    supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
+    views = [view for _, view in sorted(supervision.views.items())][:7]
+    assert TrainedScene(capture.root / "g0").psnr_unseen(views) is not None
+    assert compared == [views[0].frame_id, views[3].frame_id, views[6].frame_id]
 
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,14 +19,7 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.observed import (
-    MAX_EVALUATED,
-    Fit,
-    evaluate_views,
-    evaluated,
-    pooled_unseen,
-    render_observed,
-)
+from cleargs.formation.observed import Fit, evaluate_views, pooled_unseen, render_observed
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat import trainer as trainer_module
@@ -439,15 +432,6 @@ def test_unseen_pixels_measure_quality_without_training(pictures: list[np.ndarra
         -10 * np.log10(np.mean([0.1 ** (fit.unseen / 10) for fit in seen]))
     )
     assert pooled_unseen([Fit(20.0, None)]) is None
-
-
-def test_the_evaluated_frames_are_spread_over_the_capture(pictures: list[np.ndarray]) -> None:
-    many = [replace(views(pictures)[0], frame_id=number) for number in range(150)]
-    numbers = [view.frame_id for view in evaluated(many)]
-    assert len(numbers) == MAX_EVALUATED
-    assert {b - a for a, b in pairwise([-2, *numbers, 152])} <= {4, 5}  # 150 / 32 = 4.7
-    assert evaluated(many[:7]) == many[:7]
-    assert evaluated([]) == []
 
 
 def test_one_percent_of_each_frame_is_unseen() -> None:
