@@ -188,8 +188,10 @@ class Store:
 
         A ``forced`` rebuild has a separate folder, and resumes only from a forced attempt. Otherwise, usable
         results in ``entry`` are copied to the outputs, unless there are outputs already. Files of a killed
-        attempt stay only if they match ``leftovers``. Without the lock of the key, this process works in its
-        own folder, which takes over the common one if there is one.
+        attempt stay only if they match ``leftovers``, and checkpoints only next to the outputs that they
+        continue: a process that was killed right after `publish` moved the outputs leaves checkpoints alone.
+        Without the lock of the key, this process works in its own folder, which takes over the common one if
+        there is one.
         """
         work = WorkFolder(self.root / "work" / (f"{key}.forced" if forced else key))
         with disk_errors(work.folder):
@@ -200,6 +202,8 @@ class Store:
             _keep_only(work.out, leftovers)
             if entry is not None and entry.usable is not None and not forced and not work.out.exists():
                 _link_files(entry.folder, work.out)
+            if work.folder.exists() and not work.out.exists():
+                self.discard(work.folder)
             work.out.mkdir(parents=True, exist_ok=True)
             work.checkpoints.mkdir(parents=True, exist_ok=True)
             (work.out / MANIFEST).unlink(missing_ok=True)

@@ -177,6 +177,30 @@ def test_killed_during_cleanup_leaves_no_partial_checkpoints(
     assert [path.name for path in work.iterdir() if not path.name.startswith(".rubbish")] == []
 
 
+@pytest.mark.parametrize("force", [(), ("square",)])
+def test_checkpoints_do_not_outlive_their_outputs(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, force: tuple[str, ...]
+) -> None:
+    """Once, a stage resumed from the end of an attempt whose outputs were gone, and published the last only.
+
+    The attempt was killed right after it had published, and then the results were collected.
+    """
+    square = bench.run()[1]
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    shutil.rmtree(square.folder)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Store, "discard", killed)
+        bench.run(force=force)
+    assert square.folder.is_dir()
+    shutil.rmtree(square.folder)
+    again = bench.run(force=force)[1]
+    assert again.how == "made"
+    assert again.manifest.files == square.manifest.files
+
+
 def test_too_little_address_space_is_refused_before_any_work(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
