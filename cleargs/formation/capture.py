@@ -7,8 +7,9 @@ explains, and only then the frame is searched again. The sharper the scene becom
 finds. At the fourth look after the first one, at the eighth, and whenever their number has doubled, a path of
 a higher order is tried.
 
-Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
-is searched at the first look of a training and at these looks, since the test cannot see a skew.
+Later trainings continue with the formations of the first one, and count on. They keep the formation of a
+frame that earlier trainings have looked at `SETTLED` times. If the shutter rolls, every frame is searched at
+the first look of a training and at these looks, since the test cannot see a skew.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ DOUBTED = 0.5
 AGAIN = 4
 """Looks at a frame from the first one to the next try of a higher order, and where the shutter rolls to the
 next search. After that their number doubles from one to the next: the scene changes less and less."""
+SETTLED = 8
+"""Looks at a frame after which later trainings keep its formation. Rooms lost nothing after 15 looks, and up
+to 0.2 dB after 3 (docs/experiments/formation.md)."""
 SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
 """Share of frames with a model up to which a capture is sharp, and the fewest frames that tell. In a sharp
 capture a frame is not searched at its first look, unless the test finds blur."""
@@ -108,6 +112,8 @@ class CaptureFormation:
         real = sorted(view.frame_id for view in weighted if view.kind == "real")
         known = known or {}
         self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
+        enough = (SETTLED - 1) * config.every
+        self._settled = {frame_id for frame_id, frame in self._frames.items() if frame.draws > enough}
         if self._rolls():  # a training begins with a search
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         self._tested = {real[k] for k in _tested_frames(len(real))}
@@ -192,7 +198,7 @@ class CaptureFormation:
                 gain = explained().skew_gain
                 self._frames[frame_id] = replace(self._frames[frame_id], skew_gain=gain)
             searched = self._rolls()
-        if searched and self._frames[frame_id].draws % self._config.every == 0:
+        if searched and self._due(frame_id):
             self._frames[frame_id] = explained()
         weight = view.weight
         motion = None
@@ -260,6 +266,11 @@ class CaptureFormation:
 
     def _rolls(self) -> bool:
         return rolls(self._frames.values())
+
+    def _due(self, frame_id: int) -> bool:
+        """Return True if the formation of a frame is estimated before the next step on it."""
+        draws = self._frames[frame_id].draws
+        return draws == 0 or (draws % self._config.every == 0 and frame_id not in self._settled)
 
     def _sharp(self) -> bool:
         """Return True if few of the frames that were looked at so far needed a model."""

@@ -15,6 +15,7 @@ import torch
 from cleargs.formation.capture import (
     MAX_TESTED_FRAMES,
     MIN_TESTED_FRAMES,
+    SETTLED,
     CaptureFormation,
     _tested_frames,
     rolls,
@@ -293,6 +294,26 @@ def test_a_motion_that_no_longer_explains_its_frame_is_searched_again(
     found = formation.frames[BLURRED]
     assert abs(found.motion.blur[4]) == pytest.approx(7.0, abs=1.0) and abs(found.motion.blur[3]) < 1.0
     assert searched
+
+
+def test_a_later_training_keeps_what_was_looked_at_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that was looked at less often is looked at again."""
+    looked: list[int] = []
+
+    def look(frame: FrameFormation, *_: Any, **__: Any) -> FrameFormation:
+        looked.append(frame.frame_id)
+        return frame
+
+    monkeypatch.setattr("cleargs.formation.capture.fit_motion", look)
+    often = {k: replace(frame, draws=(SETTLED - 1) * LOOK.every + 1) for k, frame in known(f2=BLUR).items()}
+    often[0] = replace(often[0], draws=(SETTLED - 1) * LOOK.every)
+    formation = CaptureFormation(views(), LOOK, known=often)
+    run(tmp_path, views(), formation)
+    assert set(looked) == {0}
+    assert formation.frames[BLURRED].draws > often[BLURRED].draws  # its steps are counted
+    np.testing.assert_array_equal(formation.frames[BLURRED].motion.vector, BLUR.vector)
 
 
 def test_the_next_training_counts_on_and_does_not_search(tmp_path: Path, searched: list[FramePair]) -> None:
