@@ -47,9 +47,9 @@ DOUBTED = 0.5
 AGAIN = 4
 """Looks at a frame from the first one to the next try of a higher order, and where the shutter rolls to the
 next search. After that their number doubles from one to the next: the scene changes less and less."""
-SETTLED = 8
-"""Looks at a frame after which later trainings keep its formation. Rooms lost nothing after 15 looks, and up
-to 0.2 dB after 3 (docs/experiments/formation.md)."""
+SETTLED = 7
+"""Looks at a frame after which later trainings keep its formation. Scenes lost nothing after 7 and 15 looks,
+and up to 0.2 dB after 3 (docs/experiments/formation.md)."""
 SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
 """Share of frames with a model up to which a capture is sharp, and the fewest frames that tell. In a sharp
 capture a frame is not searched at its first look, unless the test finds blur."""
