@@ -8,8 +8,8 @@ finds. At the fourth look after the first one, at the eighth, and whenever their
 a higher order is tried.
 
 Later trainings continue with the formations of the first one, and count on. They keep the formation of a
-frame that earlier trainings have looked at `SETTLED` times. If the shutter rolls, every frame is searched at
-the first look of a training and at these looks, since the test cannot see a skew.
+frame that earlier trainings have looked at `SETTLED` times. If the shutter rolls, they keep none, and every
+frame is searched at the first look of a training and at these looks, since the test cannot see a skew.
 """
 
 from __future__ import annotations
@@ -112,10 +112,10 @@ class CaptureFormation:
         real = sorted(view.frame_id for view in weighted if view.kind == "real")
         known = known or {}
         self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
-        enough = (SETTLED - 1) * config.every
-        self._settled = {frame_id for frame_id, frame in self._frames.items() if frame.draws > enough}
         if self._rolls():  # a training begins with a search
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
+        enough = (SETTLED - 1) * config.every
+        self._settled = {frame_id for frame_id, frame in self._frames.items() if frame.draws > enough}
         self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
         estimated = {view.frame_id for view in weighted if view.kind == "real" and view.estimated}
