@@ -55,7 +55,7 @@ right, they are alike, and adjusted poses are in the user's world exactly."""
 _JOINED, _JOINS = 0.92, 3
 """Least share of the matches across a join whose features see one point, and most joins that are repeated
 (docs/experiments/poses.md)."""
-_MISPLACED, _PLACINGS, _FEW = 0.6, 2, 0.1
+_MISPLACED, _PLACINGS, _LEFT_OUT = 0.6, 2, 0.1
 """Share of its matches that must fit a frame's pose, and how often frames with less are placed again. Then at
 most this share of all frames is left out: more say that the matches are wrong, not the poses
 (docs/experiments/poses.md)."""
@@ -82,7 +82,7 @@ class _FeatureSettings:
 
 _FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
-_FEW, _FAINT = 0.25, 0.002
+_FEW_FEATURES, _FAINT = 0.25, 0.002
 """Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
 plain ones, in which COLMAP finds few or none (docs/experiments/poses.md)."""
 _AGAIN = (
@@ -237,7 +237,7 @@ class _Sfm:
         Those for which ``settings`` find few features get fainter ones too, unless a killed run matched them.
         """
         job = self._job
-        limit = _FEW * job.config.max_features if settings.contrast > _FAINT else 0
+        limit = _FEW_FEATURES * job.config.max_features if settings.contrast > _FAINT else 0
         options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         largest = max(max(camera.width, camera.height) for camera in job.cameras)
         options.max_image_size = largest // settings.reduced
@@ -290,7 +290,7 @@ class _Sfm:
         model, placed = self._place_the_rest(model, pairs)
         before = _names_in(model)
         model = self._corrected(self._rejoined(model, self._matched), self._matched)
-        return model, placed | dict.fromkeys(before - _names_in(model), "its matches contradict its place")
+        return model, placed | dict.fromkeys(before - _names_in(model), "too few of its matches fit its pose")
 
     def _corrected(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
         """Return ``model`` after frames that contradict their matches were placed again, or left out.
@@ -310,7 +310,7 @@ class _Sfm:
                 break
             model, shares = found, better
         contrary = [image for image, share in shares.items() if share < _MISPLACED]
-        if contrary and len(contrary) <= _FEW * len(shares):
+        if contrary and len(contrary) <= _LEFT_OUT * len(shares):
             model = copy.deepcopy(model)
             for image in contrary:
                 model.deregister_frame(model.images[image].frame_id)

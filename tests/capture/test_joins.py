@@ -102,6 +102,21 @@ def test_a_frame_that_contradicts_its_matches_is_placed_again_or_left_out(
     assert sfm_worker._names_in(right) - sfm_worker._names_in(left) == {right.images[5].name}
 
 
+def test_no_frame_is_left_out_where_more_than_a_tenth_contradict_their_matches(
+    placer: sfm_worker._Sfm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = placer._map()
+    poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}
+    away = {number: poses[number].copy() for number in (5, 8)}
+    for sign, pose in zip((1.0, -1.0), away.values(), strict=True):
+        pose[:, 3] += sign * 0.5 * np.ptp([pose[:, 3] for pose in poses.values()], axis=0).max()
+    wrong = moved(placer, right, away)
+    shares = fitting_shares(wrong, verified_matches(placer._database))
+    assert sorted(number for number, share in shares.items() if share < 0.6) == [5, 8]
+    monkeypatch.setattr(placer, "_continued", lambda model, *others: model)
+    assert placer._corrected(wrong, placer._database).num_reg_images() == 10
+
+
 def test_a_join_that_stays_wrong_is_named(
     images: Path, ingest: Ingest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
