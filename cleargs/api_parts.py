@@ -194,6 +194,7 @@ def score_frames(
 
     Raises:
         ConfigError: for an unknown evaluator.
+        StoreError: if a file cannot be read.
 
     Example:
         from pathlib import Path

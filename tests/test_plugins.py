@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import cleargs as cg
-from cleargs.errors import ConfigError, InputError
+from cleargs.errors import ConfigError, InputError, StoreError
 from cleargs.models.expert import load_expert
 from cleargs.models.scorer import load_scorer
 from cleargs.pipeline.config import load_config
@@ -121,6 +121,11 @@ def test_evaluator(parts: Path, tmp_path: Path, picture: np.ndarray) -> None:
     assert table["r_sharpness"].to_pylist() == [1.0, 0.0] and table["B"].to_pylist()[0] == 0.0
     with pytest.raises(ConfigError, match="contrasts"):
         cg.score_frames([], evaluator="contrasts")
+
+
+def test_a_missing_frame_is_an_error_with_its_name(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"gone\.png"):
+        cg.score_frames([tmp_path / "gone.png"])
 
 
 def test_expert_and_scorer(parts: Path, picture: np.ndarray) -> None:

@@ -154,7 +154,7 @@ class Batch:
         wanted = [
             (f"{name}.{kind}", ["export", str(run), "-o", f"{name}.{kind}", "--force"])
             if kind not in TARGETS
-            else (f"{name}-{kind}.*", ["export", str(run), "--for", kind, "--force"])
+            else (f"{name}-{kind}.{TARGETS[kind].ending}", ["export", str(run), "--for", kind, "--force"])
             for kind in after.export
         ]
         if after.render is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from operator import lt
@@ -101,9 +102,10 @@ def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, advance: Ca
     engine, values = rasteriser_for(), []
     for view in views:
         (fit,) = evaluate_views(scene, [view], exposure, formations, engine=engine)
-        values.append(fit.psnr)
+        if math.isfinite(fit.psnr):  # a frame without a pixel that counts has an infinite one
+            values.append(fit.psnr)
         advance()
-    return fmean(values)
+    return fmean(values) if values else math.inf
 
 
 def crop_scene(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:

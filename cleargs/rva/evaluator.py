@@ -13,6 +13,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.files import write_json
 from cleargs.media.image import read_mask, read_rgb
@@ -102,11 +103,16 @@ class ItemCache:
     def row(self, view: EvaluatedFrame, make: Callable[[EvaluatedFrame], ArrayF64]) -> ArrayF64:
         """Return the cached row of ``view``, or call ``make`` and store its row, atomically.
 
-        Raises OSError if a file of the frame is unreadable.
+        Raises StoreError if a file of the frame is unreadable.
         """
         if self.folder is None:
             return make(view)
-        parts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in (view.image, view.mask) if path]
+        try:
+            parts = [file_digest(path) for path in (view.image, view.mask) if path]
+        except OSError as error:
+            raise StoreError(
+                f"cannot read {error.filename}: {error.strerror or error}", hint="check that the file exists"
+            ) from error
         digest = hashlib.sha256(json.dumps([*self.facts, *parts]).encode()).hexdigest()
         row = self.find(self.folder / f"{digest}.json")
         if row is None:

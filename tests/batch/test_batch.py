@@ -230,6 +230,18 @@ def test_work_after_a_scene(toys: ToyBatch) -> None:
     assert toys.run() == 2
 
 
+def test_the_export_of_another_scene_with_a_longer_name_is_not_its_own(toys: ToyBatch) -> None:
+    toys.write_sheet({"a": 'after.export = ["web"]', "a-web": 'after.export = ["ply"]'})
+    scenes = read_scenes(toys.root / "sheet.toml")
+    batch = Batch(toys.dag, toys.folder, scenes, "cpu")
+    for scene in scenes:
+        batch.run_folder(scene).mkdir(parents=True)
+        (batch.run_folder(scene) / "scene.ply").write_text("a scene")
+    batch.exports.mkdir()
+    (batch.exports / "a-web.ply").touch()
+    assert [[*batch.arguments_after(scene)] != [] for scene in scenes] == [True, False]
+
+
 def test_a_killed_batch_resumes_from_its_checkpoint(toys: ToyBatch) -> None:
     sheet = toys.write_sheet({"attic": ""}, held=True)
     code = f"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import zipfile
 from pathlib import Path
@@ -15,6 +16,8 @@ from report_run import FinishedRun
 
 from cleargs.capture.model import read_model
 from cleargs.cli.main import invoke
+from cleargs.formation.observed import Fit
+from cleargs.render import pruning
 from cleargs.splat.formats import FORMATS
 from cleargs.splat.ply import read_ply
 
@@ -166,6 +169,15 @@ def test_pruning_reports_its_cost(
     both, _, _ = numbers(capsys, PRUNED)
     kept = read_ply(tmp_path / "c.ply").gaussians
     assert both > gone and float(torch.sigmoid(kept.logit_opacities).min()) >= 0.9
+
+
+def test_a_frame_without_a_pixel_that_counts_is_not_in_the_psnr_of_pruning(
+    run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    psnr = iter([math.inf, 30.0, 30.0, 30.0, 30.0, math.inf, 20.0, 20.0, 20.0, 20.0])
+    monkeypatch.setattr(pruning, "evaluate_views", lambda *views, **options: [Fit(next(psnr), None)])
+    assert export(run, tmp_path / "a.ply", "--prune", "opacity:0.1") == 0
+    assert numbers(capsys, PRUNED)[1:] == [30.0, 20.0]
 
 
 def test_a_crop_uses_the_coordinates_of_the_cameras(
