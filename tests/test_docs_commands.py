@@ -249,7 +249,6 @@ PREPARE: dict[str, Callable[[], None]] = {
     "--scene RUN/g0/scene.ply": make_measured_run,
     "--renders mine": make_renders,
     "--poses cameras.json": export_cameras,
-    "cleargs diff walk walk-2": lambda: Path("walk-2").symlink_to("walk"),
 }
 """Part of a command -> what its page takes as given, made before it runs."""
 

@@ -34,7 +34,7 @@ CONFIDENCE = "95 %"
 """Confidence of all intervals (`benchmarks.comparison.cells.student_t`)."""
 
 _MADE = "<!-- Made by `python -m benchmarks evidence`; edits are lost. -->"
-_OLDER = "This section was made from an older list of captures. The list has changed since."
+_OLDER = "This section was made from another list of captures than the present one."
 _QUICK = "This is the quick page (`--quick`): small images, short trainings, few captures."
 
 
@@ -125,7 +125,7 @@ def _contents(found: Sequence[SavedSection], origin: Origin) -> str:
             f"[{saved.section.title}]({saved.section.name}.md)",
             ", ".join(dict.fromkeys(cell.column for cell in saved.cells)),
             str(saved.section.steps),
-            saved.version + (" (older list)" if saved.section not in origin.sections else ""),
+            saved.version + (" (another list)" if saved.section not in origin.sections else ""),
         ]
         for saved in found
     ]

@@ -218,7 +218,7 @@ quality_option = click.option(
     type=click.Choice(get_args(Quality)),
     help="The cost of a run: draft is a look at no more than 60 frames of 640 px, without repairs; standard "
     "is for publishing; high takes four times its steps and twice its Gaussians. Steps and budgets that a "
-    "recipe names stay.  [default: standard]",
+    "recipe names stay.  [default: that of the run; standard for a new run]",
 )
 
 

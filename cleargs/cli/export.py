@@ -29,8 +29,8 @@ Examples:
 Formats:
   .ply              all values; read by most programs
   .compressed.ply   a quarter of the size: SuperSplat, Spark, Brush
-  .sog              a tenth of the size: SuperSplat, PlayCanvas, Spark
-  .spz              a tenth of the size: Spark, Scaniverse
+  .sog              a fifth of the size: SuperSplat, PlayCanvas, Spark
+  .spz              a seventh of the size: Spark, Scaniverse
   .glb .usdc        glTF and OpenUSD
 
 \b

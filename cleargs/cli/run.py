@@ -92,7 +92,7 @@ Files in RUN:
 @recipe_option
 @set_option
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Training steps of the first scene.")
-@click.option("--max-frames", type=click.IntRange(min=2), metavar="N", help="Most frames of a video to use.")
+@click.option("--max-frames", type=click.IntRange(min=3), metavar="N", help="Most frames of a video to use.")
 @click.option("--size", type=click.IntRange(min=64), metavar="PX", help="Long side of the images.")
 @click.option(
     "--holdout",

@@ -224,7 +224,7 @@ def test_page_of_a_few_cells() -> None:
     assert "`python -m benchmarks evidence -o OUT --section blur`, version 0.1.0, abc" in own
     assert "LPIPS (AlexNet) could not be measured" in page
     assert own.startswith("# Motion blur\n") and "| mixed (n = 3) |" in own
-    assert "older list" not in page + own
+    assert "another list" not in page + own
     assert "@" not in page, "all placeholders of the template are filled"
 
 
@@ -253,8 +253,8 @@ def test_page_names_its_sections_and_versions() -> None:
 def test_section_of_an_older_list_is_named() -> None:
     saved = found(1.0)
     older = saved.model_copy(update={"section": saved.section.model_copy(update={"steps": 999})})
-    assert "older list of captures" in section_page(older, ORIGIN)
-    assert "0.1.0, abc (older list)" in summary_page([older], ORIGIN)
+    assert "another list of captures" in section_page(older, ORIGIN)
+    assert "0.1.0, abc (another list)" in summary_page([older], ORIGIN)
 
 
 def test_front_page_names_faults_in_words(tmp_path: Path) -> None:
@@ -337,7 +337,7 @@ def test_tiny_page_is_made_and_resumed(tmp_path: Path, capsys: pytest.CaptureFix
     capsys.readouterr()
     assert make(out, spec, "--rewrite") == 0
     assert "rooms.json was made from another list of evidence" in capsys.readouterr().err
-    assert "(older list)" in read_pages(out)["all.md"]
+    assert "(another list)" in read_pages(out)["all.md"]
 
 
 def read_pages(out: Path) -> dict[str, str]:

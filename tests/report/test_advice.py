@@ -93,6 +93,8 @@ def test_a_short_training_gets_the_command_for_a_longer_one(
 def test_printed_commands_run_as_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    # On a machine that is known to be fast, both commands are expected to take a minute.
+    monkeypatch.setattr("cleargs.splat.pace.cached_pace", lambda: None)
     finished = FinishedRun(tmp_path)
     (tmp_path / "my capture").mkdir()
     for k in range(4):
