@@ -1,4 +1,4 @@
-# docker build -t cleargs . && docker run --rm -v "$PWD:/work" cleargs run walk.mp4
+# docker build -t cleargs . && docker run --rm --user "$(id -u):$(id -g)" -e HOME=/work -v "$PWD:/work" cleargs run walk.mp4
 # The commands are those of docs/install.md, "Your own environment".
 FROM python:3.12-slim
 ARG PIP_EXTRA_INDEX_URL=
