@@ -23,6 +23,7 @@ from cleargs.capture.config import CaptureConfig, SfmConfig
 from cleargs.capture.database import create_database
 from cleargs.capture.prepare import WorkFrame, prepare
 from cleargs.capture.sfm import job_of
+from cleargs.capture.sfm_features import FIRST
 from cleargs.capture.sfm_job import OWN
 from cleargs.capture.sources import open_capture
 from cleargs.progress import SilentReporter
@@ -141,7 +142,7 @@ def _worker(
     sfm = sfm_worker._Sfm(job, lambda **_: None)
     pycolmap.set_random_seed(0)
     create_database(sfm._database, job)
-    sfm._extract(sfm._database, job.names, sfm_worker._FIRST)
+    sfm._extract(sfm._database, job.names, FIRST)
     sfm._match(sfm._database, sfm._pairs())
     sfm._output.mkdir(exist_ok=True)
     return sfm

@@ -233,9 +233,10 @@ def score(image: AnyImage, *, scorer: str = "clarity-net", threads: int | None =
         image = np.random.default_rng(0).random((64, 96, 3), np.float32)
         print(cg.score(image))
     """
+    from cleargs.media.image import to_float32
     from cleargs.models.scorer import load_scorer
 
-    return load_scorer(scorer).score(_floats(image), threads=threads or usable_cores())
+    return load_scorer(scorer).score(to_float32(image), threads=threads or usable_cores())
 
 
 def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = None) -> ImageF32:
@@ -250,9 +251,10 @@ def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = 
         image = np.random.default_rng(0).random((64, 96, 3), np.float32)
         print(cg.score(cg.restore(image)))
     """
+    from cleargs.media.image import to_float32
     from cleargs.models.expert import load_expert
 
-    return load_expert(expert).restore(_floats(image), threads=threads or usable_cores())
+    return load_expert(expert).restore(to_float32(image), threads=threads or usable_cores())
 
 
 def reporter_of(progress: Progress) -> Reporter:
@@ -261,10 +263,3 @@ def reporter_of(progress: Progress) -> Reporter:
     if callable(progress):
         return LineReporter(progress, lambda text: progress(f"warning: {text}"), progress)
     return progress
-
-
-def _floats(image: AnyImage) -> ImageF32:
-    import numpy as np
-
-    floats = image.astype(np.float32)
-    return floats / np.float32(255) if image.dtype == np.uint8 else floats

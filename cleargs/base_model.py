@@ -12,7 +12,3 @@ class FrozenModel(BaseModel):
     """An immutable model without unknown fields, so that a misspelt name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Settings(FrozenModel):
-    """A table of settings."""

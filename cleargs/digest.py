@@ -79,7 +79,6 @@ class DigestMemo:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Write the new digests to the file."""
         if not self._learnt or not self._path.parent.is_dir():
             return
         try:

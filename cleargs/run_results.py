@@ -60,7 +60,6 @@ class Run:
         return tuple(name for name in installed().names if (self.folder / name).is_dir())
 
     def _repr_html_(self) -> str:
-        """Return a table of the stages, for notebooks."""
         rows = [("stage", "state", "seconds", "MB")]
         for name, made in ((name, self[name].manifest) for name in self.stages):
             rows.append((name, made.status, f"{made.seconds:.1f}", f"{made.bytes / 1e6:.1f}"))

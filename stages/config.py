@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from cleargs.base_model import Settings
+from cleargs.base_model import FrozenModel
 from cleargs.pipeline.stage import Device
 from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig, steps_from_frames
@@ -40,7 +40,7 @@ def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     return {"onnxruntime": runtime_version(device), **kernels}
 
 
-class DistilConfig(Settings):
+class DistilConfig(FrozenModel):
     """Joint distillation of raw frames and repairs. Settings that are missing here are those of [g0]."""
 
     steps: int | None = Field(

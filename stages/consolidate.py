@@ -6,19 +6,15 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from cleargs.base_model import Settings
+from cleargs.base_model import FrozenModel
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 
 from .config import MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
 from .config import other_libraries as other_libraries
-
-if TYPE_CHECKING:
-    from cleargs.rivr.targets import Supervision
 
 
 class FinalDistilConfig(DistilConfig):
@@ -29,7 +25,7 @@ class FinalDistilConfig(DistilConfig):
     )
 
 
-class ConsolidateConfig(Settings):
+class ConsolidateConfig(FrozenModel):
     """Full-Trajectory Repair Consolidation. The limits for its scene are in [rivr.harm]."""
 
     scorer: str = Field(
@@ -40,7 +36,7 @@ class ConsolidateConfig(Settings):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 39
+VERSION = 40
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -114,7 +110,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.held_back)
     if context.settings["g0"].quality == "draft":
-        return _unchanged(context, supervision)
+        return _unchanged(context)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     rows = read_selection(rivr / "selection.parquet")
     repairs, kept = latest_accepted(rows), kept_raw(rows)
@@ -167,7 +163,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     )
 
 
-def _unchanged(context: StageContext[ConsolidateConfig], supervision: Supervision) -> StageResult:
+def _unchanged(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Publish G0's scene as it is, which is all that a draft does."""
     from cleargs.rivr.distillation import TrainedScene, publish
     from cleargs.rivr.tables import write_repairs

@@ -9,12 +9,10 @@ from cleargs.capture.tables import load_frames, load_points
 from cleargs.errors import StoreError
 from cleargs.pipeline.stage import StageContext
 
-_UNKNOWN = (60, 0.5)
-"""Number of frames, and megapixels per frame, that are assumed for an unknown capture."""
+_UNKNOWN = (60, 0.5)  # number of frames, and megapixels per frame, that are assumed for an unknown capture
 _POINTS_PER_FRAME = 250
 """Sparse points per frame that are assumed before ingest: captures of 16 to 150 frames gave 80 to 350."""
-_SERIAL = 0.1
-"""Share of the work that is not parallel (a guess)."""
+_SERIAL = 0.1  # share of the work that is not parallel (a guess)
 
 
 def capture_size(context: StageContext[Any]) -> tuple[int, float]:

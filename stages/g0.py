@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -56,7 +55,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 37
+VERSION = 38
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -113,7 +112,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
-    from cleargs.splat.backend import set_threads
+    from cleargs.splat.backend import mean_psnr, set_threads
     from cleargs.splat.budget import resolve_config
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.ply import write_ply
@@ -185,8 +184,8 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "exposure": exposure is not None,
             "exposure_spread": exposure_spread,
             "moving_share": sum(float(cells.mean()) for cells in moving.values()) / len(views),
-            "psnr_strong": _mean([psnr[frame_id] for frame_id in strong if frame_id in psnr]),
-            "psnr_active": _mean(list(psnr.values())),
+            "psnr_strong": mean_psnr(psnr[frame_id] for frame_id in strong if frame_id in psnr),
+            "psnr_active": mean_psnr(psnr.values()),
             "psnr_unseen": pooled_unseen(fits),
         }
     )
@@ -211,9 +210,3 @@ def movement_expected(config: G0Config, allocation: Sequence[Mapping[str, Any]])
 
     asked = config.formation.movement
     return asked == "on" or (asked == "auto" and any(row["b_ghosting"] >= HIDING for row in allocation))
-
-
-def _mean(values: list[float]) -> float | None:
-    """Return the mean of the finite values; a frame without a pixel that counts has an infinite PSNR."""
-    finite = [value for value in values if math.isfinite(value)]
-    return sum(finite) / len(finite) if finite else None

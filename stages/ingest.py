@@ -71,7 +71,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update=limits)
 
 
-VERSION = 14
+VERSION = 15
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -101,8 +101,8 @@ def preflight(config: IngestConfig) -> None:
 
 def estimate(context: StageContext[IngestConfig]) -> Estimate:
     """Estimate the cost from the number of frames, their size, and the number of pairs to match."""
-    from cleargs.capture.prepare import reduced_size
     from cleargs.capture.sources import frame_size, open_capture
+    from cleargs.media.image import reduced_size
 
     from .cost import pace
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from cleargs.base_model import Settings
+from cleargs.base_model import FrozenModel
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.gates import GateConfig
@@ -38,7 +38,7 @@ class RoundsConfig(DistilConfig):
     )
 
 
-class RivrConfig(Settings):
+class RivrConfig(FrozenModel):
     """Render-Guided In-Video Restoration."""
 
     rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="rounds in which every target frame is repaired")
@@ -115,7 +115,7 @@ class RivrConfig(Settings):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 42
+VERSION = 43
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {

@@ -17,8 +17,7 @@ FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
 """Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
 terms."""
 
-_SIMPLE = {"SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS}
-"""Models with no distortion that `FIRST_LENS` lacks."""
+_SIMPLE = {"SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS}  # models with no distortion that `FIRST_LENS` lacks
 
 SHARED_BY = 8
 """Fewest frames per camera from which cameras of the input are adjusted with its poses."""
@@ -35,11 +34,8 @@ share (docs/experiments/poses.md)."""
 _CAPPED_PX = 4.0
 """Errors count up to this in means: COLMAP takes a match for right within 4 px of its epipolar line."""
 
-_HELD_BY = 15
-"""Fewest points that a frame must see to take part in an adjustment."""
-
-_UNPLACED_PX = 1e4
-"""Stands for the error of a match of a frame without a pose."""
+_HELD_BY = 15  # fewest points that a frame must see to take part in an adjustment
+_UNPLACED_PX = 1e4  # stands for the error of a match of a frame without a pose
 
 
 class Adjuster:

@@ -25,8 +25,7 @@ from cleargs.files import disk_error
 from cleargs.progress import Reporter, Task
 from cleargs.subprocesses import module_command
 
-_FULL = 8 * 2**20
-"""A disk with fewer free bytes is full: SQLite writes its pages in blocks of up to some MB."""
+_FULL = 8 * 2**20  # a disk with fewer free bytes is full: SQLite writes its pages in blocks of up to some MB
 
 
 def reports_to_parent() -> Callable[..., None]:

@@ -14,8 +14,8 @@ import numpy as np
 
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.layouts.video import video_frame
-from cleargs.capture.prepare import reduced
 from cleargs.errors import InputError
+from cleargs.media.image import reduced
 from cleargs.media.video import decode_grey, read_timeline
 from cleargs.progress import Reporter
 from cleargs.types import ImageU8

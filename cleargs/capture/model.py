@@ -140,14 +140,10 @@ def _image_end(data: bytes, at: int) -> int:
     return end + 9 + _POINT2D.itemsize * _count(data, end + 1)
 
 
-def _point_end(data: bytes, at: int) -> int:
-    return at + 51 + 8 * _count(data, at + 43)
-
-
 _ENDS: dict[str, Callable[[bytes, int], int]] = {
     "cameras": _camera_end,
     "images": _image_end,
-    "points3D": _point_end,
+    "points3D": lambda data, at: at + 51 + 8 * _count(data, at + 43),
 }
 """File of a model -> the position behind the entry at a position of its binary form."""
 

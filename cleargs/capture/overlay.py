@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from cleargs.media.image import image_size, read_rgb
 
-_SAMPLES = 32
-"""Pictures that are compared, evenly over the capture."""
+_SAMPLES = 32  # pictures that are compared, evenly over the capture
 
 _FEWEST = 6
 """Fewest images. In fewer, equal pixels by chance are not rare enough."""
@@ -20,11 +19,8 @@ _FEWEST = 6
 _STILL = 4.0
 """Standard deviation over the pictures, levels, up to which a pixel is still. JPEG and H.264 leave 1 to 3."""
 
-_MOVES = 10.0
-"""Median standard deviation over a picture from which the camera moves."""
-
-_EDGE = 40.0
-"""Sobel response of the mean picture, levels per pixel times 4, from which a pixel has structure."""
+_MOVES = 10.0  # median standard deviation over a picture from which the camera moves
+_EDGE = 40.0  # Sobel response of the mean picture, levels per pixel times 4, from which a pixel has structure
 
 _SHARE = 0.002, 0.5
 """Least and largest share of still structure. Above, the camera stands; below, it is a chance."""

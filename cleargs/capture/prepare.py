@@ -20,6 +20,7 @@ from cleargs.media.image import (
     read_alpha,
     read_mask,
     read_rgb,
+    reduced,
     write_mask,
     write_rgb,
 )
@@ -27,11 +28,8 @@ from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
 from cleargs.types import ImageU8, MaskU8
 
-_PANORAMAS = 3
-"""Pictures that are looked at for panoramas."""
-
-_COARSEST_MASK = 8
-"""Most pixels of a working image that one of its mask may stand for, along a side."""
+_PANORAMAS = 3  # pictures that are looked at for panoramas
+_COARSEST_MASK = 8  # most pixels of a working image that one of its mask may stand for, along a side
 
 
 @dataclass(frozen=True)
@@ -106,20 +104,6 @@ def _is_intact(image: Path, reporter: Reporter) -> bool:
             reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is written again")
             remove(image)
     return False
-
-
-def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
-    """Return the image with a long side of at most ``long_side`` px, by area averaging."""
-    width, height = reduced_size(image.shape[1], image.shape[0], long_side)
-    if (height, width) == image.shape[:2]:
-        return image
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
-    """Return width and height, scaled to a long side of at most ``long_side`` px."""
-    scale = min(1.0, long_side / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _pictures(frames: Mapping[Path, SourceFrame]) -> Iterator[tuple[Path, ImageU8]]:

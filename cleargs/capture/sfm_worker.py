@@ -1,8 +1,8 @@
 """The COLMAP side of ingest: ``python -m cleargs.capture.sfm_worker job.json``, run by `cleargs.capture.sfm`.
 
 It reads its job from JSON, works in ``job["folder"]`` and writes a binary model to ``folder/model``. Features
-and matches of a killed run are used again. Frames that mapping leaves out are tried a second time at half
-resolution.
+and matches (`cleargs.capture.sfm_features`) of a killed run are used again. Frames that mapping leaves out
+are tried a second time at half resolution.
 
 The result is the same for any number of threads: ids are given in frame order before any thread starts, every
 random choice is seeded, frames are matched by processes, and mapping and triangulation (whose least squares
@@ -15,8 +15,7 @@ import copy
 import filecmp
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations, count
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +28,11 @@ from cleargs.capture.database import (
     colmap_cameras,
     copy_without_features,
     create_database,
-    frames_with_few_features,
-    remove_features,
     set_cameras,
     why_missing,
 )
 from cleargs.capture.judging import epipolar_errors, fitting_shares, verified_matches, weakest_join
-from cleargs.capture.matching import loop_pairs, match_pairs, sequential_pairs
+from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
 from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
@@ -64,36 +61,6 @@ _FITS_PX, _FITS = 2.0, 0.5
 line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes, 0.13 with inverted ones."""
 
 
-@dataclass(frozen=True)
-class _FeatureSettings:
-    """Settings of features, and of the frames that they place."""
-
-    name: str
-    """Value of ``placed`` of these frames."""
-    reduced: int = 1
-    """The images are reduced to one over this, if any is as large as the largest."""
-    contrast: float = 0.02 / 3
-    inliers: int = 30
-    """Fewest points of the model that must fit the pose of a frame."""
-    neighbours: bool = False
-    """Placed frames within ``overlap`` of a frame that is left out get new features too: without them a
-    dark or turning stretch breaks the chain."""
-
-
-_FIRST = _FeatureSettings("sfm")
-"""COLMAP's defaults."""
-_FEW_FEATURES, _FAINT = 0.25, 0.002
-"""Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
-plain ones, in which COLMAP finds few or none (docs/experiments/poses.md)."""
-_AGAIN = (
-    _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),
-    _FeatureSettings("sfm with fainter features", neighbours=True, contrast=0.001, inliers=15),
-)
-"""For frames that are left out. A blur of 24 px at 480 is half as long at half the size, and the contrast
-that it leaves is enough (docs/experiments/poses.md). Affine-shape features and guided matching of these
-frames place no more of them."""
-
-
 def main() -> int:
     """Do the job; the exit code is 3 if it failed for a reason that was reported."""
     report = reports_to_parent()
@@ -106,13 +73,11 @@ def main() -> int:
     return 0
 
 
-class _Sfm:
+class _Sfm(Features):
     """The steps of a job."""
 
     def __init__(self, job: Job, report: Callable[..., None]) -> None:
-        self._job = job
-        self._report = report
-        self._database = job.folder / "database.db"
+        super().__init__(job, report)
         self._matched = self._database
         """The database with the features by which frames were placed."""
         self._torn_at: int | None = None
@@ -129,7 +94,7 @@ class _Sfm:
         job = self._job
         pycolmap.set_random_seed(job.seed)
         create_database(self._database, job)
-        self._extract(self._database, job.names, _FIRST)
+        self._extract(self._database, job.names, FIRST)
         with pycolmap.Database.open(self._database) as opened:
             if opened.num_keypoints() == 0:
                 raise StageError(
@@ -231,59 +196,6 @@ class _Sfm:
         lay_over(model, given, model.images.values())
         return model, placed
 
-    def _extract(self, database: Path, names: Sequence[str], settings: _FeatureSettings) -> None:
-        """SIFT on the working images; frames that have features already are skipped by COLMAP.
-
-        Those for which ``settings`` find few features get fainter ones too, unless a killed run matched them.
-        """
-        job = self._job
-        limit = _FEW_FEATURES * job.config.max_features if settings.contrast > _FAINT else 0
-        options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
-        largest = max(max(camera.width, camera.height) for camera in job.cameras)
-        options.max_image_size = largest // settings.reduced
-        options.sift.max_num_features = job.config.max_features
-        options.sift.peak_threshold = settings.contrast
-        reader = pycolmap.ImageReaderOptions()
-        if job.masks is not None:
-            reader.mask_path = job.masks
-        again = "" if settings == _FIRST else " again"
-        self._report(phase=f"finding features{again}", total=len(names))
-        size = 4 * job.threads
-        for start in range(0, len(names), size):
-            block = list(names[start : start + size])
-            pycolmap.extract_features(
-                database, job.images, image_names=block, reader_options=reader, extraction_options=options
-            )
-            few = frames_with_few_features(database, block, limit)
-            if few:
-                remove_features(database, few.values())
-                faint = copy.deepcopy(options)
-                faint.sift.peak_threshold = _FAINT
-                pycolmap.extract_features(
-                    database, job.images, image_names=[*few], reader_options=reader, extraction_options=faint
-                )
-            self._report(done=start + len(block))
-
-    def _match(self, database: Path, pairs: Sequence[tuple[int, int]], again: str = "") -> None:
-        """Match and verify pairs of frames; pairs that were matched before are skipped."""
-        job = self._job
-        self._report(phase=f"matching{again}", total=len(pairs))
-        match_pairs(database, job.names, pairs, job.seed, job.threads, lambda n: self._report(done=n))
-
-    def _pairs(self) -> list[tuple[int, int]]:
-        """All pairs of frames, or neighbours and distant frames that look alike."""
-        frames, config = len(self._job.names), self._job.config
-        if frames < config.exhaustive_below:
-            return list(combinations(range(frames), 2))
-        near = sequential_pairs(frames, config.overlap)
-        if not config.loop_candidates:
-            return near
-        self._report(phase="looking for loops", total=None)
-        with pycolmap.Database.open(self._database) as opened:
-            descriptors = [np.asarray(opened.read_descriptors(index + 1).data) for index in range(frames)]
-        loops = loop_pairs(descriptors, config.loop_candidates, 2 * config.overlap, self._job.seed)
-        return sorted({*near, *loops})
-
     def _mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
         """Return the model of the images alone, and how frames were placed."""
         model = self._rejoined(self._corrected(self._map(), self._database), self._database)
@@ -304,7 +216,7 @@ class _Sfm:
             if not wrong:
                 break
             self._report(phase="placing frames again", total=None)
-            found = self._continued(model, database, wrong, _FIRST)
+            found = self._continued(model, database, wrong, FIRST)
             better = fitting_shares(found, matches)
             if len(better) < len(shares) or min(better.values()) <= min(shares.values()):
                 break
@@ -330,7 +242,7 @@ class _Sfm:
             numbers = {found.image_id - 1 for found in model.images.values() if found.has_pose}
             before = {i for i in numbers if i < image - 1}
             self._report(phase="checking a weak join", total=None)
-            found = self._continued(model, database, min(before, numbers - before, key=len), _FIRST)
+            found = self._continued(model, database, min(before, numbers - before, key=len), FIRST)
             again, better = weakest_join(found, database)
             if better <= share or not _names_in(found) >= _names_in(model):
                 break
@@ -367,7 +279,7 @@ class _Sfm:
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
     ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Continue mapping with other features, by `_AGAIN`, while frames have no pose.
+        """Continue mapping with other features, by `AGAIN`, while frames have no pose.
 
         It works in copies of the database, so that a killed run finds the first one unchanged.
 
@@ -376,9 +288,9 @@ class _Sfm:
         """
         names, reach = self._job.names, self._job.config.overlap
         self._matched = self._database
-        placed = dict.fromkeys(_names_in(model), _FIRST.name)
+        placed = dict.fromkeys(_names_in(model), FIRST.name)
         reasons: dict[str, str] = {}
-        for settings in _AGAIN:
+        for settings in AGAIN:
             missing = [index for index, name in enumerate(names) if name not in placed]
             if not missing:
                 break
@@ -400,7 +312,7 @@ class _Sfm:
         return model, placed | reasons
 
     def _continued(
-        self, model: pycolmap.Reconstruction, database: Path, again: set[int], settings: _FeatureSettings
+        self, model: pycolmap.Reconstruction, database: Path, again: set[int], settings: FeatureSettings
     ) -> pycolmap.Reconstruction:
         """Return the result of mapping from ``model`` on, where the frames ``again`` have new features."""
         options = copy.deepcopy(self._options)

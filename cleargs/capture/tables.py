@@ -59,12 +59,8 @@ FRAMES = schema_of(Frame)
 POINTS = pa.schema(
     [
         column("point_id", pa.int64(), "unique in this table"),
-        column("x", pa.float64(), "position in the normalised world"),
-        column("y", pa.float64(), "position in the normalised world"),
-        column("z", pa.float64(), "position in the normalised world"),
-        column("r", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
-        column("g", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
-        column("b", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
+        *(column(axis, pa.float64(), "position in the normalised world") for axis in "xyz"),
+        *(column(x, pa.uint8(), "sRGB, mean over the train frames that observe the point") for x in "rgb"),
         column("error", pa.float64(), "mean reprojection error, px of the image in which features are found"),
         column("track_length", pa.int32(), "registered frames that observe the point"),
     ]

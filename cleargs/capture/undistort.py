@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics, pinhole
-from cleargs.capture.prepare import reduced, reduced_size
 from cleargs.errors import InputError
+from cleargs.media.image import reduced, reduced_size
 from cleargs.types import ImageU8, MaskU8, PlaneF32
 
 MAX_TANGENT = 1.75

@@ -44,13 +44,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_of
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
-from cleargs.pipeline.session import (
-    DeviceChoice,
-    default_folder,
-    opened_store,
-    resolve_run,
-    usable_cores,
-)
+from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.pipeline.settings import flattened
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import duration
@@ -95,9 +89,7 @@ Files in RUN:
 @click.option("--max-frames", type=click.IntRange(min=3), metavar="N", help="Most frames of a video to use.")
 @click.option("--size", type=click.IntRange(min=64), metavar="PX", help="Long side of the images.")
 @click.option(
-    "--holdout",
-    metavar="every:N|LIST",
-    help="Frames for `cleargs eval RUN`, which no training uses.",
+    "--holdout", metavar="every:N|LIST", help="Frames for `cleargs eval RUN`, which no training uses."
 )
 @click.option("--start", type=click.FloatRange(min=0), metavar="S", help="Take a video from this second on.")
 @click.option(
@@ -158,7 +150,8 @@ def run(
         folder, source = source, read_run_file(source, dag).source
     folder = folder or default_folder(source)
     if (folder / RUN_FILE).is_file():  # the user's defaults are those of new runs
-        kept = [name for name in ("store", "device", "quality") if _is_user_default(context, name)]
+        of_user = ParameterSource.DEFAULT_MAP
+        kept = [x for x in ("store", "device", "quality") if context.get_parameter_source(x) is of_user]
         store = None if "store" in kept else store
         device = "auto" if "device" in kept else device
         shortcuts["quality"] = None if "quality" in kept else shortcuts["quality"]
@@ -209,10 +202,6 @@ def run(
     if opens and page is not None:
         click.launch(page.as_uri())
     return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
-
-
-def _is_user_default(context: click.Context, name: str) -> bool:
-    return context.get_parameter_source(name) is ParameterSource.DEFAULT_MAP
 
 
 def without_effect(config: Config, given: Sequence[str]) -> Iterator[str]:
@@ -285,9 +274,6 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
     with opened_store(settings.store) as opened:
         planner = Planner(dag, settings, opened, usable_cores(), make_reporter())
         print_plans(planner.plan(), as_json)
-
-
-# -- outcomes and plans -------------------------------------------------------------------------------------
 
 
 def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:
@@ -370,7 +356,6 @@ def _times(outcomes: Sequence[StageOutcome]) -> str:
 
 
 def _next(summaries: Summaries, run: Path, scene: bool) -> str:
-    """Return the command that the user may want next."""
     if not scene:
         stage = " rva" if list(summaries)[-1] == "rva" else ""
         return f"cleargs show {quote(str(run))}{stage}"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cleargs.evaluate.config import INSTALLABLE, EvalOptions
 from cleargs.evaluate.eval_report import Region
+from cleargs.media.image import to_float32
 from cleargs.models.lpips import load_lpips, weights_file
 from cleargs.models.registry import file_digest, model_dir
 from cleargs.models.scorer import Scorer, load_scorer
@@ -74,9 +75,6 @@ def _windowed(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(cv2.sepFilter2D(values, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101))
 
 
-# -- learned metrics -------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class MetricSet:
     """The metrics of an evaluation, ready to be asked from several threads at once."""
@@ -97,9 +95,9 @@ class MetricSet:
         values = {"psnr": psnr(image, reference, mask), "ssim": ssim(image, reference, mask)}
         seen = image if mask is None else np.where(mask[..., None], image, reference)
         for name, distance in self.lpips.items():
-            values[name] = distance(_floats(seen), _floats(reference))
+            values[name] = distance(to_float32(seen), to_float32(reference))
         for name, scorer in self.scorers.items():
-            values[name] = scorer.score(_floats(image))
+            values[name] = scorer.score(to_float32(image))
         return values | dict.fromkeys(self.unavailable)
 
 
@@ -126,13 +124,6 @@ def load_metrics(options: EvalOptions) -> MetricSet:
             scorers[name] = load_scorer(name)
             weights[name] = scorers[name].digest
     return MetricSet(lpips, scorers, weights, unavailable)
-
-
-def _floats(image: ImageU8) -> ImageF32:
-    return image.astype(np.float32) / np.float32(255)
-
-
-# -- colours ---------------------------------------------------------------------------------------------
 
 
 def fit_affine(

@@ -123,8 +123,7 @@ def reference_of(
     manifest = linked_manifest(run, "ingest")
     if manifest is None:
         raise InputError(
-            f"{run} has no finished ingest: nothing is known of its world",
-            hint=f"see cleargs status {run}",
+            f"{run} has no finished ingest: nothing is known of its world", hint=f"see cleargs status {run}"
         )
     frames = load_frames(ingest)
     if directory is None:
@@ -200,13 +199,9 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
 
 
 def _run_pose(frame: Frame) -> Pose:
-    """Return the run's pose of a registered frame."""
     values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
     numbers = np.array([value for value in values if value is not None], np.float64)
     return Pose.from_quaternion(numbers[:4], numbers[4:])
-
-
-# -- two worlds -------------------------------------------------------------------------------------------
 
 
 def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Similarity, Alignment]:
@@ -270,9 +265,6 @@ def umeyama(source: NDArray[np.float64], target: NDArray[np.float64]) -> Similar
     return Similarity(rotation, source_mean - rotation.T @ target_mean / scale, 1.0 / scale)
 
 
-# -- the run's own held-out frames -------------------------------------------------------------------------
-
-
 def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
     test = [frame for frame in frames if frame.split == "test" and frame.registered]
     if not test:
@@ -317,9 +309,6 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
     return count
 
 
-# -- a folder ----------------------------------------------------------------------------------------------
-
-
 def _listed(directory: Path) -> dict[str, ReferenceView]:
     """Return the views of a folder with ``transforms.json``, by stem, in the folder's world."""
     path = directory / "transforms.json"
@@ -349,7 +338,6 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
 
 
 def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, MaskBool | None]:
-    """Return the pinhole image of a reference, and its mask."""
     image, stencil = read_image(frame), read_stencil(frame)
     if image.shape[1::-1] != (lens.width, lens.height):
         raise InputError(
@@ -370,9 +358,6 @@ def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, Ma
             hint=f"give references of at least {MIN_SIDE} pixels on each side",
         )
     return image, None if stencil is None else stencil > 0
-
-
-# -- names -------------------------------------------------------------------------------------------------
 
 
 def stem_of(name: str) -> str:

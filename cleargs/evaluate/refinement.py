@@ -25,8 +25,7 @@ LONG_SIDE = 320
 
 _BLUR = 1.0  # px of the reduced image; widens the reach of a step to a few pixels
 _DIFFERENCE = 0.25  # px that a probing movement shifts the image
-_FINE = 0.5
-"""Share of the steps at full size."""
+_FINE = 0.5  # share of the steps at full size
 
 
 def refine_pose(

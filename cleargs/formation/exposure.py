@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.parquet import read_table, write_table
-from cleargs.splat.backend import backend_for
 from cleargs.splat.initialise import SparsePoints
 from cleargs.splat.tables import EXPOSURE
 from cleargs.splat.views import TrainingView
@@ -177,13 +176,3 @@ class AffineOptimiser:
         second = self.second[i] / (1.0 - 0.999 ** int(self.steps[i]))
         self.affines[i] -= self._rate * first / (np.sqrt(second) + 1e-15)
         self.affines = centred(self.affines, self._weights)
-
-
-def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
-    """Return the image [H, W, 3] with every pixel mapped by ``affine`` [3, 4], float32."""
-    return backend_for(image.device).apply_affine(image, affine)
-
-
-def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of ``apply_affine``: with respect to the image [H, W, 3] and to the map [3, 4] (float64)."""
-    return backend_for(image.device).affine_backward(image, affine, grad_output)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit, explained_share, luminance
-from cleargs.formation.exposure import apply_affine
 from cleargs.formation.motion import MODELS, TWISTS, FrameMotion, Model, widened
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
 from cleargs.formation.search import blur_along, preferred, refine, search
 from cleargs.formation.warp import Warp, displacement_fields, path_lengths
+from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
@@ -200,7 +200,9 @@ def frame_pair(
 ) -> FramePair:
     """Return the images that a search compares. Masked pixels of the frame show the render."""
     assert rendered.depth is not None
-    image = rendered.image if affine is None else apply_affine(rendered.image, affine)
+    image = rendered.image
+    if affine is not None:
+        image = backend_for(image.device).apply_affine(image, affine)
     shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
     counts = np.ones(seen.shape[:2], np.bool_) if mask is None else mask.cpu().numpy()
     inner = shown[margin : margin + camera.height, margin : margin + camera.width]

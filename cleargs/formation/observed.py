@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.exposure import AffineOptimiser, Exposure, affine_backward, apply_affine
+from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, margin_for
 from cleargs.formation.motion import widened
 from cleargs.formation.movement import counted
@@ -23,7 +23,7 @@ from cleargs.formation.warp import (
     through_curve,
     times_slope,
 )
-from cleargs.splat.backend import psnr, rasteriser_for
+from cleargs.splat.backend import backend_for, psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS
@@ -65,7 +65,7 @@ class FormedView:
         image, device = render.image, render.image.device
         if self.affine is not None:
             self._rendered = render.image
-            image = apply_affine(image, self.affine)
+            image = backend_for(device).apply_affine(image, self.affine)
         if self.formation is not None:
             self._warp = self.warp(render)
             linear, self._to_linear = through_curve(image, linear_curve(device), CHANNELS)
@@ -88,7 +88,8 @@ class FormedView:
             light = times_slope(gradient, self._to_srgb, CHANNELS)
             gradient = times_slope(self._warp.transpose(light), self._to_linear)
         if self.affine is not None:
-            gradient, self._affine_gradient = affine_backward(self._rendered, self.affine, gradient)
+            backend = backend_for(gradient.device)
+            gradient, self._affine_gradient = backend.affine_backward(self._rendered, self.affine, gradient)
         return gradient
 
     def learn(self) -> None:

@@ -54,8 +54,8 @@ def enough_samples(fields: DisplacementFields) -> tuple[int, int]:
     """
     longest = float(np.quantile(path_lengths(fields, STRIDE), 0.95))
     widest = float(np.quantile(fields.radius[::STRIDE, ::STRIDE].cpu().numpy(), 0.95))
-    times = SAMPLES_PER_PIXEL * longest if longest > 0.05 else 1
-    points = SAMPLES_PER_DISC_PIXEL * math.pi * widest**2 if widest > 0.05 else 1
+    times = SAMPLES_PER_PIXEL * longest if longest > 0.05 else 0.0
+    points = SAMPLES_PER_DISC_PIXEL * math.pi * widest**2 if widest > 0.05 else 0.0
     return _within(times), _within(points)
 
 
@@ -71,7 +71,7 @@ def path_lengths(fields: DisplacementFields, stride: int = 1) -> ArrayF32:
 
 
 def _within(count: float) -> int:
-    return 1 if count == 1 else min(max(MIN_SAMPLES, math.ceil(count)), MAX_SAMPLES)
+    return min(max(MIN_SAMPLES, math.ceil(count)), MAX_SAMPLES) if count else 1
 
 
 @cache

@@ -45,7 +45,6 @@ def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> I
 
 
 def _cell(tile: Tile, width: int) -> ImageU8:
-    """Return the image with its label above it."""
     label = np.full((_LABEL_HEIGHT, width, 3), _MARKED if tile.marked else _BACKGROUND, np.uint8)
     cv2.putText(label, tile.label, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
     if tile.image is None:

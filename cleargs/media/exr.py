@@ -27,8 +27,7 @@ Layer: TypeAlias = NDArray[np.float16]  # [H, W, 3] scene-linear Rec.709
 Attribute: TypeAlias = int | float | str
 
 _CHANNELS = "RGB"
-_MAX_CHANNELS = 64
-"""Most channels of a file that is read; ours have six layers of three."""
+_MAX_CHANNELS = 64  # most channels of a file that is read; ours have six layers of three
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,21 +16,18 @@ from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import MAX_PIXELS
 from cleargs.safe_io import FAULTS, cause, open_regular
-from cleargs.types import AnyImage, ImageU8, MaskU8
+from cleargs.types import AnyImage, ImageF32, ImageU8, MaskU8
 
-_FORMATS = ["JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF"]
-"""Formats that are read, as Pillow names them."""
+_FORMATS = ["JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF"]  # formats that are read, as Pillow names them
 
 _HEIC = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 """Brands of HEIC files (ISO/IEC 23008-12)."""
 
-_JXL = (b"\xff\x0a", b"\0\0\0\x0cJXL ")
-"""First bytes of JPEG XL files (ISO/IEC 18181-2)."""
+_JXL = (b"\xff\x0a", b"\0\0\0\x0cJXL ")  # first bytes of JPEG XL files (ISO/IEC 18181-2)
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
-_METADATA = 2**18
-"""Bytes at the start of a file in which its metadata are."""
+_METADATA = 2**18  # bytes at the start of a file in which its metadata are
 
 _ORIENTATION, _MODEL, _EXIF = 274, 272, 0x8769
 _LENS = (42036, 37386, 41989)
@@ -132,6 +129,26 @@ def to_uint8(image: AnyImage) -> ImageU8:
     if image.dtype == np.uint8:
         return image
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
+
+
+def to_float32(image: AnyImage) -> ImageF32:
+    """Return an image of bytes as floats in [0, 1]; one of floats keeps its values."""
+    floats = image.astype(np.float32)
+    return floats / np.float32(255) if image.dtype == np.uint8 else floats
+
+
+def reduced(image: AnyImage, long_side: int) -> AnyImage:  # [H, W] or [H, W, 3]
+    """Return the image with a long side of at most ``long_side`` px, by area averaging."""
+    width, height = reduced_size(image.shape[1], image.shape[0], long_side)
+    if (height, width) == image.shape[:2]:
+        return image
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
+    """Return width and height, scaled to a long side of at most ``long_side`` px."""
+    scale = min(1.0, long_side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 @contextmanager

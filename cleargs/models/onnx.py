@@ -204,7 +204,6 @@ def in_batches(
 
 
 def _raise_exhausted(path: Path, error: Exception) -> None:
-    """Raise MemoryError if onnxruntime reports exhausted memory."""
     if any(words in str(error).lower() for words in _MEMORY_ERRORS):
         raise MemoryError(f"{path.name}: {_reason(error)}") from error
 

@@ -30,8 +30,7 @@ _PATCH_SIDE = 128  # px; side of clarity-net's training patches
 
 BLOCK = 16
 """Side of the blocks whose information is measured, px."""
-_STEPS = 255.0
-"""Number of steps of an 8-bit image between 0 and 1."""
+_STEPS = 255.0  # number of steps of an 8-bit image between 0 and 1
 _CLIPPED = 2.0  # values less than this many steps from black or white count as partly clipped
 _MIN_UNCLIPPED = 0.5  # share of unclipped values with which a block counts fully, as highlights are normal
 _FLAT, _TEXTURED = 0.5, 0.75  # standard deviation in a block, in steps; rounding alone causes up to 0.5

@@ -30,8 +30,7 @@ MULTIPLE = 64
 MIN_SIDE = 32
 """Minimum side of an image that is scored, px. Below it AlexNet's third block has almost no pixels."""
 
-_RANGE_TOLERANCE = 1e-3
-"""Tolerance for values outside [0, 1]: the spacing of float16 values near 1."""
+_RANGE_TOLERANCE = 1e-3  # tolerance for values outside [0, 1]: the spacing of float16 values near 1
 
 
 # -- image to image: overlapping tiles, blended --------------------------------------------------------------

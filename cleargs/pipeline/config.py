@@ -55,10 +55,7 @@ class Config:
 
 
 def load_config(
-    dag: Dag,
-    recipe: str | Document = "default",
-    overrides: Sequence[str] = (),
-    seed: int | None = None,
+    dag: Dag, recipe: str | Document = "default", overrides: Sequence[str] = (), seed: int | None = None
 ) -> Config:
     """Return the checked configuration of a recipe: a name, the path of a TOML file, or a document.
 
@@ -191,7 +188,6 @@ def _known(table: Any, model: Any, place: str, others: list[str]) -> Any:
 
 
 def _effective(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> BaseModel:
-    """Return the settings of a stage as those of other stages change them."""
     changed: BaseModel = getattr(stage, "effective", lambda config, others: config)(sections[name], sections)
     return changed
 
@@ -199,7 +195,6 @@ def _effective(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> Ba
 def _setting_error(
     section: str, models: Mapping[str, type[BaseModel]], error: ValidationError
 ) -> ConfigError:
-    """Return the error for the first fault that pydantic found."""
     first = error.errors(include_url=False)[0]
     name = ".".join([section, *map(str, first["loc"])])
     if first["type"] == "extra_forbidden":

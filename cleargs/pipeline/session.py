@@ -157,6 +157,5 @@ def resolve_run(
 
 
 def _listed(items: Sequence[str]) -> str:
-    """Return the first of ``items`` in one line, and the number of the others."""
     more = f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else ""
     return ", ".join(items[:MAX_LISTED]) + more

@@ -25,8 +25,7 @@ from cleargs.types import ImageU8
 Kind = Literal["film", "still", "folder"]
 
 _NUMBER = re.compile(r"%0?\d*d")
-_OPAQUE = 1 / 255
-"""Alpha from which a pixel has a depth: one level of an 8-bit image."""
+_OPAQUE = 1 / 255  # alpha from which a pixel has a depth: one level of an 8-bit image
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from cleargs.types import ArrayF64
 _SMOOTHING = (0.025, 0.1)
 """Minimum and maximum sigma of the filter along the path, as a share of the path's length. Between them,
 sigma is three quarters of the mean distance between frames. This removes shake and corners at frames."""
-_SAMPLES = 2000
-"""Minimum number of samples of the path for the filter."""
+_SAMPLES = 2000  # minimum number of samples of the path for the filter
 _PARALLEL = 0.003
 """Mean squared sine of the angle between the optical axes and their mean (3 degrees), below which the point
 where they meet is unreliable."""

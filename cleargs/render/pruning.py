@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from operator import lt
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ from cleargs.formation.table import read_formation
 from cleargs.parquet import read_table
 from cleargs.progress import Reporter
 from cleargs.rva.tables import FRAMES
-from cleargs.splat.backend import rasteriser_for
+from cleargs.splat.backend import mean_psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
@@ -102,10 +101,10 @@ def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, advance: Ca
     engine, values = rasteriser_for(), []
     for view in views:
         (fit,) = evaluate_views(scene, [view], exposure, formations, engine=engine)
-        if math.isfinite(fit.psnr):  # a frame without a pixel that counts has an infinite one
-            values.append(fit.psnr)
+        values.append(fit.psnr)
         advance()
-    return fmean(values) if values else math.inf
+    mean = mean_psnr(values)
+    return math.inf if mean is None else mean
 
 
 def crop_scene(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:

@@ -151,7 +151,6 @@ class _Advisor:
             yield from self._on_training()
 
     def _on_frames(self) -> Iterator[Advice]:
-        """Yield advice on the frames and their poses."""
         rows = self._rows
         unplaced = sum(row.role == UNPLACED for row in rows)
         available = self._figure("ingest", "frames_available") or 0
@@ -195,7 +194,6 @@ class _Advisor:
             yield Advice(what, why, NO_FIGURE, 0.5)
 
     def _on_training(self) -> Iterator[Advice]:
-        """Yield advice on the trainings."""
         yield from self._on_steps()
         spread = self._figure("g0", "exposure_spread") or 0.0
         if spread > self._setting("g0", "exposure_threshold") and not self._figure("g0", "exposure"):
@@ -204,7 +202,6 @@ class _Advisor:
             yield Advice(what, why, NO_FIGURE, 0.8, tuple(_set({"g0.exposure": "auto"})))
 
     def _on_steps(self) -> Iterator[Advice]:
-        """Yield advice on the length of the training and the size of the images."""
         steps, quality = self._figure("g0", "steps") or 0, self._setting("g0", "quality")
         standard = steps_from_frames(sum(bool(row.weight) for row in self._rows))
         size = self._setting("ingest", "max_size")

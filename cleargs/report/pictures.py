@@ -18,7 +18,7 @@ from cleargs.formation.frames import view_of
 from cleargs.formation.motion import pixel_paths
 from cleargs.formation.movement import still_pixels
 from cleargs.media.exr import from_layer
-from cleargs.media.image import read_rgb, to_uint8
+from cleargs.media.image import read_rgb, reduced, to_uint8
 from cleargs.report.frames import HELD_OUT, FrameRow, camera_of
 from cleargs.rivr.distillation import TrainedScene
 from cleargs.splat.render import Viewer
@@ -145,19 +145,13 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
 
 
 def _expected_layers(row: FrameRow) -> int:
-    """Return how many layers a frame has besides the final scene."""
     if row.selection is not None and row.selection.exr is not None:
         return 6 if row.modelled else 5
     return 4 if row.modelled else 1
 
 
 def _write_frame(
-    row: FrameRow,
-    run: Path,
-    report: Path,
-    final: ImageU8 | None,
-    formed: Mapping[str, ImageU8],
-    side: int,
+    row: FrameRow, run: Path, report: Path, final: ImageU8 | None, formed: Mapping[str, ImageU8], side: int
 ) -> FramePictures:
     images = {**layers_of(row, run), **formed}
     if row.modelled:
@@ -199,12 +193,8 @@ def with_paths(image: ImageU8, row: FrameRow) -> ImageU8:
 
 def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:
     """Write ``image`` [H, W, 3] sRGB to a JPEG file of the report, at most ``side`` px wide or high."""
-    height, width = image.shape[:2]
-    factor = min(1.0, side / max(height, width))
-    if factor < 1.0:
-        width, height = max(1, round(width * factor)), max(1, round(height * factor))
-        image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    small = reduced(image, side)
+    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
     (report / name).write_bytes(data.tobytes())
-    return ImageFile(name, width, height)
+    return ImageFile(name, small.shape[1], small.shape[0])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
+from base64 import b64encode
 from pathlib import Path
 
 from markupsafe import escape
@@ -32,7 +32,7 @@ def write_single_file(page: Path, target: Path) -> int:
     """
     folder = page.parent
     images = {
-        file.relative_to(folder).as_posix(): "data:image/jpeg;base64," + _base64(file)
+        file.relative_to(folder).as_posix(): f"data:image/jpeg;base64,{b64encode(file.read_bytes()).decode()}"
         for file in sorted(folder.rglob("*.jpg"))
     }
     html, shown = for_others(page.read_text(encoding="utf-8"), folder.parent), set()
@@ -54,7 +54,3 @@ def write_single_file(page: Path, target: Path) -> int:
 def for_others(html: str, run: Path) -> str:
     """Return a page of ``run`` whose commands do not have the path of this machine's program."""
     return html.replace(f"{escape(program(run.parent))} ", "cleargs ")
-
-
-def _base64(file: Path) -> str:
-    return base64.b64encode(file.read_bytes()).decode()

@@ -19,7 +19,7 @@ from cleargs.capture.folders import spread
 from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.deblur import deblur
-from cleargs.formation.exposure import apply_affine, read_exposure, write_exposure
+from cleargs.formation.exposure import read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, fit_motion
 from cleargs.formation.movement import TOLERANCE, read_movement, still_pixels, write_movement
 from cleargs.formation.observed import (
@@ -30,12 +30,13 @@ from cleargs.formation.observed import (
     render_observed,
 )
 from cleargs.formation.table import read_formation, write_formation
+from cleargs.media.image import to_float32
 from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import hide_masked
 from cleargs.rivr.harm import Fidelity
-from cleargs.splat.backend import psnr, rasteriser_for
+from cleargs.splat.backend import backend_for, psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.ply import read_ply, write_ply
@@ -76,9 +77,7 @@ class Explained:
 def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
     """Return O_t as float32 sRGB, and its mask."""
     pixels, mask = view.load()
-    if pixels.dtype == np.uint8:
-        return pixels.astype(np.float32) / np.float32(255.0), mask
-    return pixels.astype(np.float32), mask
+    return to_float32(pixels), mask
 
 
 class TrainedScene:
@@ -274,7 +273,9 @@ class TrainedScene:
 
 def _deblurred(formed: FormedView, render: Render, observed: ImageF32, mask: MaskBool | None) -> ImageF32:
     """Return ``observed`` without its motion; ``render`` is the scene at the camera of ``formed``."""
-    shown = render.image if formed.affine is None else apply_affine(render.image, formed.affine)
+    shown = render.image
+    if formed.affine is not None:
+        shown = backend_for(shown.device).apply_affine(shown, formed.affine)
     weight = np.ones(observed.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
     return deblur(shown.clamp(0.0, 1.0).cpu().numpy(), observed, weight, formed.warp(render))
 

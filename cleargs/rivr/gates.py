@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cleargs.base_model import Settings
+from cleargs.base_model import FrozenModel
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.types import ArrayF64, ImageF32, MaskBool
 
@@ -31,7 +31,7 @@ _FLAT = 0.02  # a block of lower standard deviation has too little texture to be
 _AT_REST = 0.8  # see `_lengths`
 
 
-class GateConfig(Settings):
+class GateConfig(FrozenModel):
     """Limits of the disagreement of a repair with both raw frame and render (docs/experiments/rivr.md)."""
 
     max_share: float = Field(

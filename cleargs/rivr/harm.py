@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cleargs.base_model import Settings
+from cleargs.base_model import FrozenModel
 
 
-class HarmConfig(Settings):
+class HarmConfig(FrozenModel):
     """Margins beyond which a distilled scene is worse than G0 on the frames held out from repair.
 
     These frames remain in the raw supervision, as for G0. Otherwise the distilled scene would be measured on

@@ -86,13 +86,15 @@ def assess(
     reliable = allocation.is_reliable(r, b, config)
     stand_in = np.zeros_like(reliable) if reliable.any() else allocation.stand_in_set(r, b, config)
     reference = reliable | stand_in
-    centres = geometry.camera_centres(poses.rotations[rows], poses.translations[rows])
-    directions = geometry.view_directions(poses.rotations[rows])
+    rotations = poses.rotations[rows]
+    centres = np.asarray(-np.einsum("nij,ni->nj", rotations, poses.translations[rows]))  # -R^T t
+    directions = rotations[:, 2, :]  # OpenCV axes, z forward
     seen = geometry.visibility(frame_id[rows], observations.frame_id, observations.point_id)
     C = geometry.coverage_gain(seen, reference)
     D = geometry.pose_diversity(centres, directions, reference, config)
     overlap = geometry.redundancy(seen, reference)
-    G = geometry.geometric_utility(C, D, overlap, config)
+    # Paper, eq. vista_geometry.
+    G = np.clip(config.alpha * C + config.beta * D - config.eta * overlap, 0.0, 1.0)
     bins = geometry.cut_into_bins(
         geometry.cumulative_motion(centres, directions, config), config.frames_per_bin
     )

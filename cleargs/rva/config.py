@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator, model_validator
 
-from cleargs.base_model import FrozenModel, Settings, Unit
+from cleargs.base_model import FrozenModel, Unit
 from cleargs.plugins import require_known
 
 _SUM_TOLERANCE = 1e-9  # weights such as 0.30 + 0.25 + ... do not sum to exactly 1 in binary
@@ -27,7 +27,7 @@ _NOT_IN_KEY = Field(json_schema_extra={"key": False})
 """Keeps a setting that does not change the scores out of the stage's key."""
 
 
-class QwenConfig(Settings):
+class QwenConfig(FrozenModel):
     """Settings of the evaluator ``qwen3-vl``: a vision-language model on a server.
 
     The server's API key comes from the environment (CLEARGS_VLM_API_KEY) and is never written to a file.
@@ -90,7 +90,7 @@ class EvaluatorConfig(FrozenModel):
         return self
 
 
-class AssessmentConfig(Settings):
+class AssessmentConfig(FrozenModel):
     """All settings of RVA except those of the evaluator. Defaults are the paper's where it gives a value."""
 
     # Geometric evidence from poses and observations.

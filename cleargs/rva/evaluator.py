@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from cleargs.digest import file_digest
@@ -19,7 +18,7 @@ from cleargs.files import write_json
 from cleargs.media.image import read_mask, read_rgb
 from cleargs.progress import Reporter
 from cleargs.safe_io import read_json
-from cleargs.types import AnyImage, ArrayF64, ImageU8, MaskU8
+from cleargs.types import ArrayF64, ImageU8, MaskU8
 
 
 @dataclass(frozen=True)
@@ -45,16 +44,6 @@ def load_view(view: EvaluatedFrame) -> tuple[ImageU8, MaskU8 | None]:
     if mask is not None and mask.shape != rgb.shape[:2]:
         raise StoreError(f"the mask {view.mask} differs in size from its image", hint=hint)
     return rgb, mask
-
-
-def downscale(image: AnyImage, long_side: int) -> AnyImage:
-    """Return ``image`` with a long side of at most ``long_side`` px, by area averaging."""
-    height, width = image.shape[:2]
-    scale = long_side / max(height, width)
-    if scale >= 1.0:
-        return image
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 class Evaluator(Protocol):

@@ -15,21 +15,7 @@ from scipy.spatial.distance import cdist
 from cleargs.rva.config import AssessmentConfig
 from cleargs.types import ArrayBool, ArrayF64, ArrayInt
 
-_PAIRS_AT_ONCE = 1 << 20
-"""Pairs of frames in memory at a time (8 MB per float64 array)."""
-
-
-def camera_centres(
-    rotations: ArrayF64,  # [N, 3, 3] world to camera
-    translations: ArrayF64,  # [N, 3]
-) -> ArrayF64:  # [N, 3] in the world
-    """Return the camera centres -R^T t."""
-    return np.asarray(-np.einsum("nij,ni->nj", rotations, translations))
-
-
-def view_directions(rotations: ArrayF64) -> ArrayF64:  # [N, 3, 3] world to camera -> [N, 3] unit vectors
-    """Return the optical axes in the world: the third rows of R (OpenCV axes, z forward)."""
-    return rotations[:, 2, :]
+_PAIRS_AT_ONCE = 1 << 20  # pairs of frames in memory at a time (8 MB per float64 array)
 
 
 def view_angle(chord: ArrayF64) -> ArrayF64:
@@ -126,11 +112,6 @@ def redundancy(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # [N,
         overlap = np.where(i == j, 0.0, shared.data / (size[i] + size[j] - shared.data))
         np.maximum.at(largest, i, overlap)
     return largest
-
-
-def geometric_utility(C: ArrayF64, D: ArrayF64, O: ArrayF64, config: AssessmentConfig) -> ArrayF64:
-    """Return G = alpha C + beta D - eta O, clipped to [0, 1] (paper, eq. vista_geometry)."""
-    return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from cleargs.rva.evaluator import downscale
+from cleargs.media.image import reduced
 from cleargs.types import ArrayF64, ImageU8, MaskBool, MaskU8, PlaneF32
 
 LONG_SIDE = 640
@@ -68,10 +68,10 @@ def reduce_luminance(
 ) -> Luminance:
     """Return the luma in full and reduced size. A reduced pixel is valid if all its source pixels are."""
     full = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    small = downscale(full, LONG_SIDE)
+    small = reduced(full, LONG_SIDE)
     if mask is None:
         return Luminance(full, small, np.ones(small.shape, dtype=bool))
-    return Luminance(full, small, downscale((mask > 0).astype(np.float32), LONG_SIDE) > 0.999)
+    return Luminance(full, small, reduced((mask > 0).astype(np.float32), LONG_SIDE) > 0.999)
 
 
 def erode_valid(valid: MaskBool, radius: int) -> MaskBool:

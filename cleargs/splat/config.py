@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cleargs.base_model import Settings, Unit
+from cleargs.base_model import FrozenModel, Unit
 
 # Numbers of steps and Gaussians if the settings leave them unset (measured in docs/experiments/training.md).
 # Steps follow the number of frames, so that each frame is seen often enough. Gaussians follow the number of
@@ -43,7 +43,7 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
     return max(1, int(BUDGET_FACTOR[quality] * standard))
 
 
-class FormationConfig(Settings):
+class FormationConfig(FrozenModel):
     """Settings of image formation, which is estimated per raw frame during the training."""
 
     enabled: bool = Field(
@@ -79,7 +79,7 @@ class FormationConfig(Settings):
     """Exponent p in the weight of an explained frame, max(w_RVA, min(1, median misfit / misfit)^p)."""
 
 
-class TrainConfig(Settings):
+class TrainConfig(FrozenModel):
     """Settings of the optimisation of a scene.
 
     All trainings of a run (G0, the rounds of RIVR, the consolidation) share one schedule of image sizes,

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from cleargs.media.image import to_uint8
 from cleargs.random_streams import Stream
 from cleargs.splat.config import INIT_OPACITY, INIT_SCALE
 from cleargs.splat.constants import SH_C0
@@ -175,7 +176,4 @@ def _points_of_view(
         axis=1,
     )
     world = np.einsum("ni,ij->nj", rays * np.exp(log_depth)[:, None] - translation, rotation)
-    colour = image[rows, columns]
-    if colour.dtype != np.uint8:
-        colour = np.rint(np.clip(colour, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return world, colour
+    return world, to_uint8(image[rows, columns])

@@ -19,8 +19,7 @@ from cleargs.splat.scene import Scene
 
 _ANTIALIAS = "cleargs antialias"
 _BACKGROUND = "cleargs background"
-_MAX_LINE_BYTES = 4096
-"""Maximum length of a line in the header."""
+_MAX_LINE_BYTES = 4096  # maximum length of a line in the header
 
 
 def write_ply(path: Path, scene: Scene) -> None:

@@ -24,8 +24,7 @@ _ROW = np.dtype(
 )
 """Type of a row in memory; ``kind`` is True for a pseudo view."""
 
-_RECENT = 50
-"""Number of steps in the running mean of the PSNR."""
+_RECENT = 50  # number of steps in the running mean of the PSNR
 
 PREVIEW_SIDE = 640
 """Maximum of the longer side of a preview, px."""

@@ -41,8 +41,7 @@ from cleargs.splat.train_log import PREVIEW_SIDE, TrainLog, write_preview
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, TrainingView, require_views
 
-_NOTE_INTERVAL = 10
-"""Steps between updates of the progress bar, and on a GPU between updates of the log."""
+_NOTE_INTERVAL = 10  # steps between updates of the progress bar, and on a GPU between updates of the log
 
 _CHECK_INTERVAL = 10
 """Steps between checks for NaN and infinity (a check takes less than 1 ms for 50,000 Gaussians)."""

@@ -57,7 +57,6 @@ class Balloon:
         self._phases = rng.uniform(0, 2 * np.pi, 3)
 
     def states(self, times: ArrayF64) -> ArrayF64:
-        """See `Movers`."""
         centres = self.items[0]["centre"] + SWAY * np.sin(self._rates * times[..., None] + self._phases)
         return np.concatenate([centres, np.ones((*times.shape, 1))], -1)[..., None, :]
 

@@ -16,6 +16,7 @@ from cleargs.capture.database import create_database
 from cleargs.capture.judging import fitting_shares, verified_matches, weakest_join
 from cleargs.capture.model import SparseModel
 from cleargs.capture.prepare import prepare
+from cleargs.capture.sfm_features import FIRST
 from cleargs.capture.sfm_job import Job, SfmOutcome
 from cleargs.capture.sources import open_capture
 from cleargs.progress import Reporter, SilentReporter
@@ -46,7 +47,7 @@ def placer(images: Path, tmp_path: Path) -> sfm_worker._Sfm:
     placer = sfm_worker._Sfm(job, lambda **_: None)
     pycolmap.set_random_seed(0)
     create_database(placer._database, job)
-    placer._extract(placer._database, job.names, sfm_worker._FIRST)
+    placer._extract(placer._database, job.names, FIRST)
     placer._match(placer._database, placer._pairs())
     placer._output.mkdir()
     return placer

@@ -26,7 +26,7 @@ from cleargs.capture.choice import held_out, holdout_hash, sharpness
 from cleargs.capture.database import apply_exif_focal
 from cleargs.capture.folders import frame_key, masks_of, natural_key, spread
 from cleargs.capture.layouts.transforms import read_transforms
-from cleargs.capture.layouts.video import choose_times
+from cleargs.capture.layouts.video import _shares, choose_times
 from cleargs.capture.matching import loop_pairs, sequential_pairs
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.prepare import WorkFrame, read_image, read_stencil
@@ -274,6 +274,13 @@ def test_frames_are_chosen_in_time() -> None:
     assert len(choose_times(timeline, 1000, 150)) == 20
     assert [timeline.seconds(index) for index in choose_times(timeline, 1.0, 3)] == [0, 5, 10]
     assert choose_times(Timeline((7,), 0.01, None), 5.0, 150) == [0]
+
+
+def test_videos_share_the_frames_by_their_length() -> None:
+    short, long, single, empty = (Timeline(pts, 0.01, None) for pts in ((0, 100), (0, 100, 200), (7,), ()))
+    assert _shares([long], 150) == [150]
+    assert _shares([short, long, empty], 150) == [50, 100, 0]
+    assert _shares([single, empty, single, single], 2) == [1, 0, 1, 0]
 
 
 @given(st.integers(1, 300), st.integers(2, 50))

@@ -30,6 +30,7 @@ from cleargs.formation.motion import FrameMotion, pixel_paths
 from cleargs.formation.warp import (
     Warp,
     displacement_fields,
+    enough_samples,
     linear_curve,
     padded,
     samples,
@@ -54,6 +55,14 @@ MOTIONS = {
     "curved": BENT,
     "curved, two passes": SLIGHTLY_BENT,
 }
+
+
+def test_a_blur_of_exactly_one_pixel_is_a_blur() -> None:
+    plane = torch.zeros(16, 16)
+    for length, blurred in ((0.0, False), (1.0, True)):
+        sweep = torch.stack([torch.full_like(plane, length), plane])
+        times, points = enough_samples(DisplacementFields(torch.zeros_like(sweep), sweep, plane))
+        assert (times > 1, points) == (blurred, 1)
 
 
 @pytest.mark.parametrize("margin", [0, 12])

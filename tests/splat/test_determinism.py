@@ -15,7 +15,7 @@ import torch
 from helpers.splat_scenes import make_camera, make_gaussians
 from cleargs.splat.backend import psnr, rasteriser_for
 from helpers.losses import adam_step, photometric_loss
-from cleargs.formation.exposure import affine_backward
+from cleargs.splat.backend import backend_for
 from cleargs.splat.backend import set_threads
 
 def digest(threads):
@@ -32,7 +32,7 @@ def digest(threads):
         view = engine.forward(scene, camera, depth=True, antialias=step == 2)
         loss = photometric_loss(view.image, target, ssim_lambda=0.2, mask=mask)
         gradients = engine.backward(loss.grad_image, view.alpha, view.depth)
-        _, affine = affine_backward(view.image, torch.eye(3, 4), loss.grad_image)
+        _, affine = backend_for("cpu").affine_backward(view.image, torch.eye(3, 4), loss.grad_image)
         for tensor in (*view, loss.grad_image, affine, engine.visible, *gradients.tensors().values()):
             result.update(tensor.numpy().tobytes())
         result.update(repr((loss.loss, loss.l1, loss.ssim, psnr(view.image, target))).encode())

@@ -26,7 +26,6 @@ from cleargs.safe_io import FAULTS, open_regular, read_text
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `Layout.detect`."""
     return poses and bool(_models(source))
 
 

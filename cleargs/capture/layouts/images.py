@@ -25,7 +25,6 @@ def detect(source: Path, *, poses: bool) -> bool:
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """See `Layout.externals`."""
     images = _images_of(source)
     return {"capture" if images == source else "images": images, **mask_externals(source)}
 

@@ -26,12 +26,10 @@ POSES_BOUNDS = "poses_bounds.npy"
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `Layout.detect`."""
     return poses and (source / POSES_BOUNDS).is_file()
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """See `Layout.externals`."""
     folders = {folder.name: folder for folder in image_folders(source)}
     return {"poses_bounds": source / POSES_BOUNDS, **folders, **mask_externals(source)}
 

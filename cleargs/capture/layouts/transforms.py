@@ -63,7 +63,6 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """See `Layout.open_capture`."""
     files = _listings(source)
     notes: list[str] = []
     frames: list[SourceFrame] = []

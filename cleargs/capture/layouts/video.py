@@ -25,7 +25,6 @@ def detect(source: Path, *, poses: bool) -> bool:
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """See `Layout.externals`."""
     videos = _videos(source)
     if len(videos) == 1:
         return {"capture": videos[0]}
@@ -91,10 +90,9 @@ def _videos(source: Path) -> list[Path]:
 def _shares(timelines: Sequence[Timeline], at_most: int) -> list[int]:
     """Share ``at_most`` frames out by the length of each video, by largest remainders."""
     spans = [timeline.seconds(-1) - timeline.seconds(0) if timeline.pts else 0.0 for timeline in timelines]
-    total = sum(spans)
-    if len(spans) == 1 or total == 0:
-        return [at_most] * len(spans)
-    wanted = [at_most * span / total for span in spans]
+    if not any(spans):  # single frames
+        spans = [float(bool(timeline.pts)) for timeline in timelines]
+    wanted = [at_most * span / sum(spans) for span in spans]
     shares = [int(share) for share in wanted]
     order = sorted(range(len(wanted)), key=lambda number: shares[number] - wanted[number])
     for number in order[: at_most - sum(shares)]:

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from cleargs.errors import StageError
+from cleargs.media.image import reduced
 from cleargs.progress import Reporter
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, downscale, load_view
+from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, load_view
 from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.rva.vlm.server import EncodedImage, QwenServer, UnscoredError
 from cleargs.types import ArrayF64
@@ -84,4 +85,4 @@ class QwenEvaluator:
         if mask is not None:
             rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
         masked = mask is not None and not mask.all()
-        return self._server.score(EncodedImage(downscale(rgb, _LONG_SIDE), masked))
+        return self._server.score(EncodedImage(reduced(rgb, _LONG_SIDE), masked))

@@ -52,7 +52,6 @@ def _fields(file: Path) -> dict[str, int]:
 
 
 def _read(file: Path) -> str:
-    """Return the text of a file, or an empty string if it cannot be read."""
     try:
         return file.read_text(encoding="ascii", errors="replace")
     except OSError:

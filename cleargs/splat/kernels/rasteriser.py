@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -88,10 +87,6 @@ class Buffers:
             memory = torch.empty(size + size // 4 if grows else size, dtype=dtype, device=self.device)
             self.memory[name] = memory
         return memory[:size].view(shape)
-
-    def allocated_bytes(self, names: Iterable[str]) -> int:
-        """Return the size of the memory with these names."""
-        return sum(self.memory[name].nbytes for name in names if name in self.memory)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +208,8 @@ class Rasteriser(ABC):
 
     def _require_memory(self, pairs: int, camera: Camera) -> None:
         """Raise StageError if there are too many pairs to number, or if their buffers would not fit."""
-        missing = pairs * self.pair_bytes - self._buffers.allocated_bytes(self.pair_buffers)
+        memory = self._buffers.memory
+        missing = pairs * self.pair_bytes - sum(memory[n].nbytes for n in self.pair_buffers if n in memory)
         if pairs > MAX_PAIRS:
             excess = f"more than the limit of {MAX_PAIRS:.2e}"
         elif missing > UNCHECKED_BYTES and missing > available_memory(self._buffers.device):

@@ -39,9 +39,6 @@ def rasteriser(device: torch.device) -> CpuRasteriser:
     return CpuRasteriser()
 
 
-# -- loss --------------------------------------------------------------------------------------------------
-
-
 def loss_sums(
     image: Tensor,
     target: Tensor,
@@ -90,9 +87,6 @@ def _compared(
     return _read(image), _read(target), None if mask is None else _read(mask)
 
 
-# -- optimiser ---------------------------------------------------------------------------------------------
-
-
 def adam_step(
     parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate
 ) -> None:
@@ -103,15 +97,8 @@ def adam_step(
     value, slope, m, v = (tensor.detach().view(-1).numpy() for tensor in (parameter, gradient, first, second))
     with LAUNCHING:
         elementwise.adam(
-            value,
-            slope,
-            m,
-            v,
-            np.tile(corrected, max(1, ADAM_BLOCK // columns)),
-            np.float32(beta1),
-            np.float32(beta2),
-            np.float32(ADAM_EPSILON),
-            np.float32(math.sqrt(1.0 - beta2**step)),
+            *(value, slope, m, v, np.tile(corrected, max(1, ADAM_BLOCK // columns))),
+            *map(np.float32, (beta1, beta2, ADAM_EPSILON, math.sqrt(1.0 - beta2**step))),
         )
 
 
@@ -124,9 +111,6 @@ def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, sc
     if scale > 0.0:
         scales = np.exp(gaussians.log_scales.numpy())
         gradients.log_scales.numpy()[:] += np.float32(scale / scales.size) * scales
-
-
-# -- densification -----------------------------------------------------------------------------------------
 
 
 def refine(
@@ -162,20 +146,12 @@ def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
     key = np.random.SeedSequence([*seed]).generate_state(1, np.uint64)[0]
+    means, log_scales, rotations = gaussians.means, gaussians.log_scales, gaussians.rotations
     with LAUNCHING:
         elementwise.add_noise(
-            gaussians.means.numpy(),
-            gaussians.log_scales.numpy(),
-            gaussians.rotations.numpy(),
-            gaussians.logit_opacities.numpy(),
-            amount,
-            min_opacity,
-            densification.NOISE_CUT,
-            key,
+            *(means.numpy(), log_scales.numpy(), rotations.numpy(), gaussians.logit_opacities.numpy()),
+            *(amount, min_opacity, densification.NOISE_CUT, key),
         )
-
-
-# -- colour ------------------------------------------------------------------------------------------------
 
 
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
@@ -196,9 +172,6 @@ def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple
     return grad_image, torch.tensor(sums, dtype=torch.float64).reshape(3, 4)
 
 
-# -- motion and defocus ------------------------------------------------------------------------------------
-
-
 def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) -> DisplacementFields:
     height, width = (side - 2 * margin for side in depth.shape)
     offset, sweep = torch.empty(2, height, width), torch.empty(2, height, width)
@@ -206,15 +179,8 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
     curve = torch.empty(4, height, width) if motion[CURVES:].any() else None
     with LAUNCHING:
         frame_warp.displacements(
-            _read(depth),
-            _read(alpha),
-            margin,
-            motion.numpy(),
-            offset.numpy(),
-            sweep.numpy(),
-            radius.numpy(),
-            None if curve is None else curve.numpy(),
-            reach,
+            *(_read(depth), _read(alpha), margin, motion.numpy(), offset.numpy(), sweep.numpy()),
+            *(radius.numpy(), None if curve is None else curve.numpy(), reach),
         )
     return DisplacementFields(offset, sweep, radius, float(reach.max()), curve)
 
@@ -258,9 +224,6 @@ def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
     with LAUNCHING:
         frame_warp.multiply(_read(light), _read(slope), out.numpy())
     return out
-
-
-# -- search for the motion -----------------------------------------------------------------------------------
 
 
 def flow(basis: ArrayF32, twist: npt.NDArray[np.float64]) -> ArrayF32:
@@ -308,20 +271,8 @@ def normal_equations(
     matrices, sides = np.empty((height, count, count)), np.empty((height, count))
     with LAUNCHING:
         frame_search.normal_equations(
-            image,
-            smooth,
-            observed,
-            weight,
-            basis,
-            down,
-            offset,
-            sweep,
-            curve,
-            times,
-            outlier,
-            active,
-            matrices,
-            sides,
+            *(image, smooth, observed, weight, basis, down, offset, sweep, curve),
+            *(times, outlier, active, matrices, sides),
         )
     return matrices.sum(axis=0), sides.sum(axis=0)
 
@@ -340,8 +291,6 @@ def blur_sums(
     lower: npt.NDArray[np.float64] = sums.sum(axis=0)
     return np.asarray(lower + np.tril(lower, -1).swapaxes(1, 2))
 
-
-# -- compiling ahead of use ------------------------------------------------------------------------------
 
 SIZE = 16
 """Width and height of the tiny images on which `warm_up` runs the kernels."""
@@ -396,14 +345,8 @@ def _warm_up_formation() -> None:
         misfit(pixels, pixels, pixels, (offset, sweep, radius, curve), np.zeros((1, 3), np.float32), 1.0)
         normal_equations(
             *(pixels, pixels, pixels, pixels),
-            np.zeros((6, 2, SIZE, SIZE), np.float32),
-            np.zeros(SIZE, np.float32),
-            offset,
-            sweep,
-            curve,
-            np.zeros(1, np.float32),
-            1.0,
-            np.arange(6),
+            *(np.zeros((6, 2, SIZE, SIZE), np.float32), np.zeros(SIZE, np.float32), offset, sweep),
+            *(curve, np.zeros(1, np.float32), 1.0, np.arange(6)),
         )
     flow(np.zeros((6, 2, SIZE, SIZE), np.float32), np.zeros(6))
     blur_sums(pixels, pixels, pixels, 2, 4)

@@ -18,8 +18,7 @@ from cleargs.types import AnyArray, ArrayF32
 TERMS = 8
 """The regressors 1, R, R_x, R_y, R_xx / 2, R_xy, R_yy / 2, and the photograph."""
 
-_DARK = np.float32(0.02)
-"""Linear light below which noise no longer falls with the light."""
+_DARK = np.float32(0.02)  # linear light below which noise no longer falls with the light
 _HALF = np.float32(0.5)
 _QUARTER = np.float32(0.25)
 

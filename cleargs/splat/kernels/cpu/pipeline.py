@@ -74,15 +74,8 @@ class CpuRasteriser(rasteriser.Rasteriser):
         tile_counts = self._integers("tile_counts", n)
         radii = self._floats("radii", n)
         projection.project(
-            read_parameters(gaussians),
-            inputs.sh_count,
-            view,
-            inputs.antialias,
-            width,
-            height,
-            splats,
-            tile_counts,
-            radii,
+            *(read_parameters(gaussians), inputs.sh_count, view, inputs.antialias, width, height),
+            *(splats, tile_counts, radii),
         )
         self.radii = torch.from_numpy(radii)
 
@@ -120,16 +113,8 @@ class CpuRasteriser(rasteriser.Rasteriser):
         depths = self._floats("depth", height, width) if depth else None
         with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.forward(
-                width,
-                height,
-                state.tile_offsets,
-                state.pair_ids,
-                state.splats,
-                state.background,
-                image,
-                state.transmittance,
-                state.last,
-                depths,
+                *(width, height, state.tile_offsets, state.pair_ids, state.splats, state.background),
+                *(image, state.transmittance, state.last, depths),
             )
         alpha = np.subtract(np.float32(1), state.transmittance, out=self._floats("alpha", height, width))
         return Render(
@@ -145,16 +130,9 @@ class CpuRasteriser(rasteriser.Rasteriser):
         pair_sums = self._floats("pair_sums", len(state.pair_ids), columns)
         with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.backward(
-                state.camera.width,
-                state.camera.height,
-                state.tile_offsets,
-                state.pair_ids,
-                state.pair_slots,
-                state.splats,
-                state.background,
-                state.transmittance,
-                state.last,
-                grad_image.numpy(),
+                *(state.camera.width, state.camera.height, state.tile_offsets, state.pair_ids),
+                *(state.pair_slots, state.splats, state.background, state.transmittance),
+                *(state.last, grad_image.numpy()),
                 None if grad_alpha is None else grad_alpha.numpy(),
                 None if grad_depth is None else grad_depth.numpy(),
                 pair_sums,
@@ -162,13 +140,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
         parameters = state.gaussians.tensors()
         outputs = {name: self._floats(f"grad_{name}", *value.shape) for name, value in parameters.items()}
         gradients.backpropagate(
-            read_parameters(state.gaussians),
-            state.sh_count,
-            state.view,
-            state.antialias,
-            state.splats,
-            state.pair_offsets,
-            pair_sums,
-            tuple(outputs.values()),
+            *(read_parameters(state.gaussians), state.sh_count, state.view, state.antialias),
+            *(state.splats, state.pair_offsets, pair_sums, tuple(outputs.values())),
         )
         return Gaussians(**{name: torch.from_numpy(output) for name, output in outputs.items()})

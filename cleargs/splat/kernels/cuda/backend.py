@@ -1,4 +1,7 @@
-"""`cleargs.splat.backend.Backend` for NVIDIA GPUs: Triton kernels behind functions of tensors."""
+"""`cleargs.splat.backend.Backend` for NVIDIA GPUs: Triton kernels behind functions of tensors.
+
+`Backend` documents the functions.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +35,12 @@ def warm_up() -> None:
 
 
 def squared_errors(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[float, float]:
-    """See `Backend`."""
     errors = (image.detach().double() - target.double()).square()
     errors = errors if mask is None else errors[mask]
     return float(errors.sum()), float(errors.numel())
 
 
 def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
-    """See `Backend`."""
     if opacity > 0.0:
         opacities = gaussians.logit_opacities.sigmoid()
         gradients.logit_opacities += opacity / gaussians.num * opacities * (1 - opacities)

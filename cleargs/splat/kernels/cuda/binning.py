@@ -16,11 +16,6 @@ from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cuda import device_layout
 
 
-def key_type(tiles: int) -> torch.dtype:
-    """Return the smallest integer type that holds all tile numbers and their end."""
-    return torch.int16 if tiles < 2**15 - 1 else torch.int32
-
-
 @triton.jit
 def tile_range(low, high, tiles):
     """Return tiles [begin, end) with a pixel centre in the interval [low, high] px; 0, 0 if there is none."""

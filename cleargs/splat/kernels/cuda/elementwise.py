@@ -53,7 +53,6 @@ def adam(
 def adam_step(
     parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate
 ) -> None:
-    """See ``cleargs.splat.backend.adam_step``."""
     size, (beta1, beta2) = parameter.numel(), ADAM_BETAS
     rates = rate if isinstance(rate, Tensor) else torch.full((1,), rate, device=parameter.device)
     rates = rates.to(parameter.device, torch.float32).reshape(-1)
@@ -66,13 +65,12 @@ def adam_step(
 
 
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
-    """See ``cleargs.formation.exposure.apply_affine``."""
     affine = _on_device(affine, image)
     return image.detach() @ affine[:, :3].T + affine[:, 3]
 
 
 def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
-    """See ``cleargs.formation.exposure.affine_backward``. Both gradients stay on the device."""
+    """Both gradients stay on the device."""
     colours = torch.nn.functional.pad(image.detach().double(), (0, 1), value=1.0)  # [H, W, 4]
     # One channel at a time: torch sums in a fixed order, which a matrix product does not promise.
     sums = [(grad_output[..., channel, None] * colours).sum(dim=(0, 1)) for channel in range(3)]

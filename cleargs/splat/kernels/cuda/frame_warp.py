@@ -30,14 +30,8 @@ LEAST_LIGHT = 1e-18
 def twist_of(motion, part):
     """Return a twist of a frame's motion, by its number in ``cleargs.formation.motion.TWISTS``."""
     first = motion + layout.TWISTS + 6 * part
-    return (
-        tl.load(first),
-        tl.load(first + 1),
-        tl.load(first + 2),
-        tl.load(first + 3),
-        tl.load(first + 4),
-        tl.load(first + 5),
-    )
+    tx, ty, tz = tl.load(first), tl.load(first + 1), tl.load(first + 2)
+    return tx, ty, tz, tl.load(first + 3), tl.load(first + 4), tl.load(first + 5)
 
 
 @triton.jit
@@ -279,10 +273,7 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
         depth.contiguous(),
         alpha.contiguous(),
         motion.to(depth.device, non_blocking=True),  # read before the call returns
-        *_planes(fields),
-        height,
-        width,
-        margin,
+        *(*_planes(fields), height, width, margin),
         CURVED=curve is not None,
         BLOCK=BLOCK,
         num_warps=4,
@@ -292,19 +283,11 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
 
 @memory_errors()
 def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
-    """See ``cleargs.formation.warp.Warp.forward``."""
     height, width = fields.radius.shape
     light = image.new_empty(height, width, CHANNELS)
     gather_light[(_blocks(fields.radius),)](
-        image.contiguous(),
-        *_planes(fields),
-        samples,
-        light,
-        height,
-        width,
-        margin,
-        len(samples),
-        1.0 / len(samples),
+        *(image.contiguous(), *_planes(fields), samples, light),
+        *(height, width, margin, len(samples), 1.0 / len(samples)),
         TAPS=_taps(samples),
         CURVED=fields.curve is not None,
         BLOCK=BLOCK,
@@ -315,7 +298,6 @@ def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin
 
 @memory_errors()
 def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
-    """See ``cleargs.formation.warp.Warp.transpose``."""
     height, width = fields.radius.shape
     brightest = light.abs().amax().clamp(min=LEAST_LIGHT)
     # The next power of two, so that scaling rounds nothing. It is NaN if the light is not finite.
@@ -325,15 +307,8 @@ def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, 
         height + 2 * margin, width + 2 * margin, CHANNELS, dtype=torch.int64, device=light.device
     )
     return_light[(_blocks(fields.radius),)](
-        light.contiguous(),
-        *_planes(fields),
-        samples,
-        2.0**bits / len(samples) / bound,
-        sums,
-        height,
-        width,
-        margin,
-        len(samples),
+        *(light.contiguous(), *_planes(fields), samples, 2.0**bits / len(samples) / bound, sums),
+        *(height, width, margin, len(samples)),
         TAPS=_taps(samples),
         CURVED=fields.curve is not None,
         BLOCK=BLOCK,
@@ -359,15 +334,10 @@ def _blocks(plane: Tensor) -> int:
 
 @memory_errors()
 def through_curve(image: Tensor, curve: Tensor, channels: int) -> tuple[Tensor, Tensor]:
-    """See ``cleargs.formation.warp.through_curve``."""
     height, width, stored = image.shape
     out, slope = image.new_empty(height, width, channels), image.new_empty(height, width, 3)
     follow_curve[(_blocks(image[..., 0]),)](
-        image.contiguous(),
-        curve,
-        out,
-        slope,
-        height * width,
+        *(image.contiguous(), curve, out, slope, height * width),
         FROM=stored,
         TO=channels,
         BLOCK=BLOCK,
@@ -377,5 +347,4 @@ def through_curve(image: Tensor, curve: Tensor, channels: int) -> tuple[Tensor, 
 
 
 def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
-    """See ``cleargs.formation.warp.times_slope``."""
     return torch.nn.functional.pad(light[..., :3] * slope, (0, channels - 3))

@@ -73,21 +73,9 @@ class CudaRasteriser(rasteriser.Rasteriser):
         image, alpha = take("image", *shape, 3), take("alpha", *shape)
         depths = take("depth", *shape) if depth else None
         rasterise.forward[(tiles_of(camera),)](
-            state.tile_starts,
-            state.chunk_starts,
-            state.pair_ids,
-            state.splats,
-            state.background,
-            image,
-            alpha,
-            state.transmittance,
-            state.last,
-            alpha if depths is None else depths,
-            state.chunk_planes,
-            state.chunk_tiles,
-            state.deepest,
-            camera.width,
-            camera.height,
+            *(state.tile_starts, state.chunk_starts, state.pair_ids, state.splats, state.background),
+            *(image, alpha, state.transmittance, state.last, alpha if depths is None else depths),
+            *(state.chunk_planes, state.chunk_tiles, state.deepest, camera.width, camera.height),
             WITH_DEPTH=depth,
             PLANES=state.planes,
             num_warps=FORWARD_WARPS,
@@ -104,44 +92,22 @@ class CudaRasteriser(rasteriser.Rasteriser):
         columns = layout.SUM_DEPTH if grad_depth is None else layout.PAIR_COLUMNS
         chunk_behind = take("chunk_behind", chunks, layout.TILE_PIXELS)
         pair_sums = take("pair_sums", max(pairs, 1), layout.PAIR_COLUMNS)
+        by_alpha, by_depth = (grad_image if grad is None else grad for grad in (grad_alpha, grad_depth))
+        given: dict[str, Any] = {"HAS_DEPTH": grad_depth is not None, "PLANES": state.planes}
         rasterise.behind[(tiles,)](
-            state.chunk_starts,
-            state.chunk_planes,
-            state.deepest,
-            state.background,
-            state.transmittance,
-            grad_image,
-            grad_image if grad_alpha is None else grad_alpha,
-            grad_image if grad_depth is None else grad_depth,
-            chunk_behind,
-            camera.width,
-            camera.height,
+            *(state.chunk_starts, state.chunk_planes, state.deepest, state.background, state.transmittance),
+            *(grad_image, by_alpha, by_depth, chunk_behind, camera.width, camera.height),
             HAS_ALPHA=grad_alpha is not None,
-            HAS_DEPTH=grad_depth is not None,
-            PLANES=state.planes,
+            **given,
             num_warps=4,
         )
         if pairs:
             rasterise.backward[(chunks,)](
-                state.tile_starts,
-                state.chunk_starts,
-                state.chunk_tiles,
-                state.chunk_planes,
-                chunk_behind,
-                state.deepest,
-                state.pair_ids,
-                state.pair_slots,
-                state.splats,
-                state.last,
-                grad_image,
-                grad_image if grad_depth is None else grad_depth,
-                pair_sums,
-                tiles,
-                camera.width,
-                camera.height,
-                HAS_DEPTH=grad_depth is not None,
-                PLANES=state.planes,
+                *(state.tile_starts, state.chunk_starts, state.chunk_tiles, state.chunk_planes, chunk_behind),
+                *(state.deepest, state.pair_ids, state.pair_slots, state.splats, state.last),
+                *(grad_image, by_depth, pair_sums, tiles, camera.width, camera.height),
                 COLUMNS=columns,
+                **given,
                 num_warps=BACKWARD_WARPS,
             )
         parameters = state.gaussians.tensors()
@@ -153,12 +119,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
             )
             gradients.backpropagate[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in parameters.values()),
-                state.view,
-                state.splats,
-                state.tile_counts,
-                totals,
-                *outputs.values(),
-                n,
+                *(state.view, state.splats, state.tile_counts, totals, *outputs.values(), n),
                 SH_STORED=state.gaussians.sh.shape[1],
                 SH_COUNT=state.sh_count,
                 ANTIALIAS=state.antialias,
@@ -182,14 +143,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
         if n:
             projection.project[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in gaussians.tensors().values()),
-                view,
-                splats,
-                depth_keys,
-                tile_counts,
-                self.radii,
-                n,
-                width,
-                height,
+                *(view, splats, depth_keys, tile_counts, self.radii, n, width, height),
                 SH_STORED=gaussians.sh.shape[1],
                 SH_COUNT=inputs.sh_count,
                 ANTIALIAS=inputs.antialias,
@@ -200,22 +154,15 @@ class CudaRasteriser(rasteriser.Rasteriser):
         pair_ends = tile_counts[order].cumsum(0)
         pairs = int(pair_ends[-1]) if n else 0
         self._require_memory(pairs, camera)
-        pair_tiles = take("pair_tiles", pairs, dtype=binning.key_type(tiles))
+        # The smallest type that holds all tile numbers and their end.
+        pair_tiles = take("pair_tiles", pairs, dtype=torch.int16 if tiles < 2**15 - 1 else torch.int32)
         pair_owners = take("pair_owners", pairs, dtype=torch.int32)
         pair_ids = take("pair_ids", pairs, dtype=torch.int32)
         pair_slots = take("pair_slots", pairs, dtype=torch.int32)
         if pairs:
             binning.list_pairs[(-(-n // LIST_BLOCK),)](
-                splats,
-                order,
-                tile_counts,
-                pair_ends,
-                pair_starts,
-                pair_tiles,
-                pair_owners,
-                n,
-                width,
-                height,
+                *(splats, order, tile_counts, pair_ends, pair_starts, pair_tiles, pair_owners),
+                *(n, width, height),
                 num_warps=1,
                 enable_fp_fusion=False,
             )

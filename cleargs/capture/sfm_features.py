@@ -1,0 +1,106 @@
+"""Features of frames, and matches between them: the first steps of COLMAP's process."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from cleargs.capture.colmap import pycolmap
+from cleargs.capture.database import frames_with_few_features, remove_features
+from cleargs.capture.matching import loop_pairs, match_pairs, sequential_pairs
+from cleargs.capture.sfm_job import Job
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """Settings of features, and of the frames that they place."""
+
+    name: str
+    """Value of ``placed`` of these frames."""
+    reduced: int = 1
+    """The images are reduced to one over this, if any is as large as the largest."""
+    contrast: float = 0.02 / 3
+    inliers: int = 30
+    """Fewest points of the model that must fit the pose of a frame."""
+    neighbours: bool = False
+    """Placed frames within ``overlap`` of a frame that is left out get new features too: without them a
+    dark or turning stretch breaks the chain."""
+
+
+FIRST = FeatureSettings("sfm")  # COLMAP's defaults
+_FEW_FEATURES, _FAINT = 0.25, 0.002
+"""Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
+plain ones, in which COLMAP finds few or none (docs/experiments/poses.md)."""
+AGAIN = (
+    FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),
+    FeatureSettings("sfm with fainter features", neighbours=True, contrast=0.001, inliers=15),
+)
+"""For frames that are left out. A blur of 24 px at 480 is half as long at half the size, and the contrast
+that it leaves is enough (docs/experiments/poses.md). Affine-shape features and guided matching of these
+frames place no more of them."""
+
+
+class Features:
+    """The steps of a job that find and match features in its database."""
+
+    def __init__(self, job: Job, report: Callable[..., None]) -> None:
+        self._job = job
+        self._report = report
+        self._database = job.folder / "database.db"
+
+    def _extract(self, database: Path, names: Sequence[str], settings: FeatureSettings) -> None:
+        """SIFT on the working images; frames that have features already are skipped by COLMAP.
+
+        Those for which ``settings`` find few features get fainter ones too, unless a killed run matched them.
+        """
+        job = self._job
+        limit = _FEW_FEATURES * job.config.max_features if settings.contrast > _FAINT else 0
+        options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
+        largest = max(max(camera.width, camera.height) for camera in job.cameras)
+        options.max_image_size = largest // settings.reduced
+        options.sift.max_num_features = job.config.max_features
+        options.sift.peak_threshold = settings.contrast
+        reader = pycolmap.ImageReaderOptions()
+        if job.masks is not None:
+            reader.mask_path = job.masks
+        again = "" if settings == FIRST else " again"
+        self._report(phase=f"finding features{again}", total=len(names))
+        size = 4 * job.threads
+        for start in range(0, len(names), size):
+            block = list(names[start : start + size])
+            pycolmap.extract_features(
+                database, job.images, image_names=block, reader_options=reader, extraction_options=options
+            )
+            few = frames_with_few_features(database, block, limit)
+            if few:
+                remove_features(database, few.values())
+                faint = copy.deepcopy(options)
+                faint.sift.peak_threshold = _FAINT
+                pycolmap.extract_features(
+                    database, job.images, image_names=[*few], reader_options=reader, extraction_options=faint
+                )
+            self._report(done=start + len(block))
+
+    def _match(self, database: Path, pairs: Sequence[tuple[int, int]], again: str = "") -> None:
+        job = self._job
+        self._report(phase=f"matching{again}", total=len(pairs))
+        match_pairs(database, job.names, pairs, job.seed, job.threads, lambda n: self._report(done=n))
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """All pairs of frames, or neighbours and distant frames that look alike."""
+        frames, config = len(self._job.names), self._job.config
+        if frames < config.exhaustive_below:
+            return list(combinations(range(frames), 2))
+        near = sequential_pairs(frames, config.overlap)
+        if not config.loop_candidates:
+            return near
+        self._report(phase="looking for loops", total=None)
+        with pycolmap.Database.open(self._database) as opened:
+            descriptors = [np.asarray(opened.read_descriptors(index + 1).data) for index in range(frames)]
+        loops = loop_pairs(descriptors, config.loop_candidates, 2 * config.overlap, self._job.seed)
+        return sorted({*near, *loops})
