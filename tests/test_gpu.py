@@ -166,16 +166,7 @@ def test_obstacles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_self_test_needs_neither_pycolmap_nor_pydantic() -> None:
     """A machine for a test may have PyTorch, Triton, Numba and SciPy only."""
     pytest.importorskip("triton")
-    absent = (
-        "pycolmap",
-        "OpenImageIO",
-        "pydantic",
-        "pyarrow",
-        "cv2",
-        "safetensors",
-        "click",
-        "rich",
-    )
+    absent = ("pycolmap", "OpenImageIO", "pydantic", "pyarrow", "cv2", "safetensors", "click", "rich")
     code = f"""
 import sys
 sys.modules.update(dict.fromkeys({absent}))

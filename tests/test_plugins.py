@@ -93,9 +93,7 @@ def test_the_version_of_the_package_is_in_the_key(parts: Path) -> None:
     sections = load_config(installed(), "default", overrides).sections
     assert plugin_versions(sections["g0"]) == {}
     assert plugin_versions(sections["rva"]) == {"cleargs-parts for evaluator=contrast": "1.0"}
-    assert plugin_versions(sections["rivr"]) == {
-        "cleargs-parts for tiebreak_scorer=gradient": "1.0",
-    }
+    assert plugin_versions(sections["rivr"]) == {"cleargs-parts for tiebreak_scorer=gradient": "1.0"}
     install(parts, "1.1")
     assert plugin_versions(sections["rva"]) == {"cleargs-parts for evaluator=contrast": "1.1"}
     for stage in ("rivr", "consolidate"):  # a plugin has no file outside the store

@@ -24,10 +24,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "eval.json": ("eval.json", lambda folder: read_report(folder / "eval.json")),
     "note of a report": ("report/report.json", report_json._read_report),
     "kept findings": ("a.json", lambda folder: ItemCache(folder, ("a",), ()).find(folder / "a.json")),
-    "receipt of a model": (
-        "musiq.receipt.json",
-        lambda folder: read_receipt(find_model("musiq"), folder),
-    ),
+    "receipt of a model": ("musiq.receipt.json", lambda folder: read_receipt(find_model("musiq"), folder)),
     "published weights": (
         "weights",
         lambda folder: read_checked(folder / "weights", find_model("lpips").source),

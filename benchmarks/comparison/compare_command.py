@@ -85,11 +85,7 @@ Examples:
     help=f"Variants to train: {', '.join(variant.name for variant in VARIANTS)}.  [default: all]",
 )
 @click.option(
-    "--seeds",
-    default="0",
-    show_default=True,
-    callback=_seeds,
-    help="Training seeds for each capture.",
+    "--seeds", default="0", show_default=True, callback=_seeds, help="Training seeds for each capture."
 )
 @click.option(
     "--steps",

@@ -141,10 +141,7 @@ def camera_course(cameras: Sequence[ArrayF64], frames: int) -> CameraCourse:
     start = int(np.argmin(windows.max(1)))
     spacing = float(np.median(windows[start]))
     if spacing <= 0:
-        raise InputError(
-            "all cameras are at one place",
-            hint="give the cameras of a path through the scene",
-        )
+        raise InputError("all cameras are at one place", hint="give the cameras of a path through the scene")
     stretch = poses[start : start + used].reshape(used, 12)
     spline = make_smoothing_spline(np.arange(used), stretch, lam=SMOOTHING)
     return CameraCourse(spline, float(frames - 1), spacing)

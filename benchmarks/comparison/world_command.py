@@ -41,13 +41,7 @@ Example:
     help="Seed of the path and the degradations.",
 )
 def world(
-    out: Path,
-    scene: Path,
-    cameras: Path | None,
-    protocol: str,
-    frames: int,
-    size: tuple[int, int],
-    seed: int,
+    out: Path, scene: Path, cameras: Path | None, protocol: str, frames: int, size: tuple[int, int], seed: int
 ) -> None:
     """Make a synthetic handheld capture in a trained scene, in the new folder OUT.
 

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cleargs.cli.common import (
-    DONE_IN_PART,
-    json_option,
-    print_json,
-    quiet_option,
-    run_argument,
-    work_options,
-)
+from cleargs.cli.common import DONE_IN_PART, json_option, print_json, quiet_option, run_argument, work_options
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import tree_digest
 from cleargs.errors import InputError

@@ -132,14 +132,7 @@ Examples:
 @click.option("--threads", type=click.IntRange(1), help="Number of threads.  [default: all cores]")
 @click.option("--repeats", default=4, show_default=True, type=click.IntRange(1), help="Number of rounds.")
 @json_option
-def train(
-    gaussians: int,
-    width: int,
-    height: int,
-    threads: int | None,
-    repeats: int,
-    as_json: bool,
-) -> None:
+def train(gaussians: int, width: int, height: int, threads: int | None, repeats: int, as_json: bool) -> None:
     """Time one training iteration (SH degree 3) and measure its error.
 
     The parts are forward pass, loss, backward pass and Adam.

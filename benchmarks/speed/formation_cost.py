@@ -24,13 +24,7 @@ from benchmarks.speed.timing import Quartiles, interleave, ratio
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
 from cleargs.formation.observed import FormedView
-from cleargs.formation.warp import (
-    displacement_fields,
-    linear_curve,
-    srgb_curve,
-    through_curve,
-    times_slope,
-)
+from cleargs.formation.warp import displacement_fields, linear_curve, srgb_curve, through_curve, times_slope
 from cleargs.progress import Reporter
 from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera

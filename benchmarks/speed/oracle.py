@@ -111,10 +111,7 @@ def in_depth_order(gaussians: Gaussians, camera: Camera) -> Tensor:
     # The oracle sorts by depth only. So Gaussians whose colour is their index reveal the order.
     numbers = torch.arange(gaussians.num, dtype=torch.float64)
     tagged = Gaussians(
-        **{
-            **gaussians.detach().tensors(),
-            "sh": (numbers / constants.SH_C0)[:, None, None].expand(-1, 1, 3),
-        }
+        **{**gaussians.detach().tensors(), "sh": (numbers / constants.SH_C0)[:, None, None].expand(-1, 1, 3)}
     )
     colours = reference.project(tagged, camera, 1, antialias=False).colours[:, 0]
     return (colours - constants.SH_OFFSET).round().long()

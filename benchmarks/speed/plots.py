@@ -103,12 +103,7 @@ def _line(panel: Axes, values: list[tuple[int, float]], colour: str) -> None:
     line = straight_line(values)
     numbers = np.geomspace(min(x for x, _ in values), max(x for x, _ in values), 50)
     panel.plot(
-        numbers,
-        line.offset + line.slope * numbers,
-        "--",
-        color=colour,
-        linewidth=1,
-        label="best linear fit",
+        numbers, line.offset + line.slope * numbers, "--", color=colour, linewidth=1, label="best linear fit"
     )
 
 

@@ -23,9 +23,7 @@ class CaptureConfig(FrozenModel):
         "alone decides",
     )
     max_frames: int = Field(
-        150,
-        ge=3,
-        description="most frames to take, evenly; in a video, the sharpest nearby",
+        150, ge=3, description="most frames to take, evenly; in a video, the sharpest nearby"
     )
     start: float | None = Field(
         None, ge=0, description="take a video from this time on, s; unset: from its first frame on"

@@ -44,10 +44,7 @@ To run scenes in parallel on a cluster, see docs/cluster.md.
 )
 @click.argument("sheet", type=click.Path(dir_okay=False, path_type=Path))
 @output_option(
-    "Folder of the batch.  [default: SHEET with the ending .batch]",
-    "folder",
-    metavar="BATCH",
-    required=False,
+    "Folder of the batch.  [default: SHEET with the ending .batch]", "folder", metavar="BATCH", required=False
 )
 @until_option
 @quality_option

@@ -71,11 +71,7 @@ def quiet_option(command: F) -> F:
             "object per event.  [default: auto]",
         ),
         click.option(
-            "--log",
-            type=FILE,
-            expose_value=False,
-            callback=keep,
-            help="Also write messages to this file.",
+            "--log", type=FILE, expose_value=False, callback=keep, help="Also write messages to this file."
         ),
         click.option("-q", "--quiet", is_flag=True, help="Print warnings and results only."),
     ):

@@ -247,9 +247,6 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
     return {name: target / name / SCENE for name in chosen or [scene_stage(dag, target, None)]}
 
 
-# -- on the terminal ---------------------------------------------------------------------------------------
-
-
 def _print(report: Report, output: Path | None) -> None:
     from rich.console import Console
     from rich.table import Table

@@ -67,11 +67,7 @@ renders a picture for each pose.
     "--size", callback=parse_size, metavar="WxH", help="Size of a picture.  [default: size of the frames]"
 )
 @click.option(
-    "--fps",
-    type=click.FloatRange(1, 240),
-    default=30.0,
-    show_default=True,
-    help="Pictures per second.",
+    "--fps", type=click.FloatRange(1, 240), default=30.0, show_default=True, help="Pictures per second."
 )
 @click.option(
     "--seconds",

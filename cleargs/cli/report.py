@@ -138,10 +138,7 @@ It updates itself. After the run, it shows the report.
     help="Address to listen on. Most others allow other machines to read the report.",
 )
 @click.option(
-    "--port",
-    type=click.IntRange(0, 65_535),
-    default=0,
-    help="Port to listen on.  [default: any free port]",
+    "--port", type=click.IntRange(0, 65_535), default=0, help="Port to listen on.  [default: any free port]"
 )
 @open_option("Open the page in the browser.")
 @store_option

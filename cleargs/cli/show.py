@@ -84,12 +84,7 @@ Examples:
     metavar="N",
     help="Show all facts about frame N, and write a picture of its layers.",
 )
-@click.option(
-    "-o",
-    "--output",
-    type=FILE,
-    help="File of --frame (.png).  [default: RUN/frame-N.png]",
-)
+@click.option("-o", "--output", type=FILE, help="File of --frame (.png).  [default: RUN/frame-N.png]")
 @json_option
 @click.pass_obj
 def show(
@@ -225,9 +220,6 @@ def text_of(value: Any) -> str:
     return str(value)
 
 
-# -- one frame -----------------------------------------------------------------------------------------------
-
-
 def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: Path, as_json: bool) -> None:
     """Write a picture of a frame's layers, and print all facts about it, as lines or as JSON.
 
@@ -326,9 +318,6 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
             yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
     if repair := facts["distilled"]:
         yield "final scene", f"trained on {CHOICES[repair['chosen']]} of round {repair['round']}"
-
-
-# -- on the terminal -----------------------------------------------------------------------------------------
 
 
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:

@@ -103,9 +103,5 @@ def _planar(rgb: ImageU8) -> VideoFrame:
     kr, kb = LUMA["bt709"]
     red, green, blue = np.moveaxis(rgb / 255, -1, 0)
     luma = kr * red + (1 - kr - kb) * green + kb * blue
-    planes = [
-        16 + 219 * luma,
-        128 + 112 * (blue - luma) / (1 - kb),
-        128 + 112 * (red - luma) / (1 - kr),
-    ]
+    planes = [16 + 219 * luma, 128 + 112 * (blue - luma) / (1 - kb), 128 + 112 * (red - luma) / (1 - kr)]
     return VideoFrame.from_ndarray(np.rint(np.stack(planes)).astype(np.uint8), format="yuv444p")

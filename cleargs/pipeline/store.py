@@ -29,14 +29,7 @@ from typing import Literal
 from cleargs.digest import DigestMemo
 from cleargs.errors import StoreError
 from cleargs.files import disk_errors, is_partial, sync, sync_tree, write_bytes
-from cleargs.manifest import (
-    MANIFEST,
-    Manifest,
-    damages,
-    hidden_link,
-    read_manifest,
-    write_manifest,
-)
+from cleargs.manifest import MANIFEST, Manifest, damages, hidden_link, read_manifest, write_manifest
 from cleargs.pipeline.lock import exclusive_lock, file_lock, is_locked
 from cleargs.progress import Reporter
 from cleargs.safe_io import FAULTS, read_text
@@ -111,8 +104,6 @@ class Store:
         self.root = root
         self.memo = memo
 
-    # -- reading ---------------------------------------------------------------------------------------
-
     def folder(self, stage: str, key: str) -> Path:
         """Return the folder for the finished results of ``key``, which need not exist."""
         return self.root / stage / key
@@ -133,8 +124,6 @@ class Store:
         if manifest.key != key or manifest.stage != stage:
             return Entry(folder, None, "the manifest belongs to another folder")
         return Entry(folder, manifest, next(damages(folder, manifest, manifest.files, self.memo), None))
-
-    # -- working ---------------------------------------------------------------------------------------
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
@@ -258,8 +247,6 @@ class Store:
         """Return the folder for results per item of ``stage`` (`StageContext.cache`)."""
         return self.root / "kept" / stage
 
-    # -- links from runs -------------------------------------------------------------------------------
-
     def link(self, run: Path, stage: str, key: str) -> None:
         """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN."""
         target = self.folder(stage, key)
@@ -294,8 +281,6 @@ class Store:
             with disk_errors(note):
                 note.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(note, f"{run}\n".encode())
-
-    # -- removing --------------------------------------------------------------------------------------
 
     def collect(self, stages: tuple[str, ...], *, checkpoints: bool, dry_run: bool) -> list[Garbage]:
         """Remove finished results that no run links to, and the remains of deleted folders. Return them.

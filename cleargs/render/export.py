@@ -159,8 +159,7 @@ def _write_sidecars(
             target, content = output.parent / inside, file.read_bytes()
             if target.is_file() and target.read_bytes() != content and not force:
                 raise InputError(
-                    f"{target} exists already, of another export",
-                    hint="choose another name, or give --force",
+                    f"{target} exists already, of another export", hint="choose another name, or give --force"
                 )
             with disk_errors(target):
                 target.parent.mkdir(parents=True, exist_ok=True)

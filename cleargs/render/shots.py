@@ -61,11 +61,7 @@ class ShotOptions:
         """Raise InputError if the options contradict each other, or ``output``."""
         ending, still, posed = output.suffix.lower(), self.frame is not None, self.poses is not None
         for wrong, message, hint in (
-            (
-                still + self.turntable + posed > 1,
-                "two of --frame, --turntable, --poses",
-                "give one of them",
-            ),
+            (still + self.turntable + posed > 1, "two of --frame, --turntable, --poses", "give one of them"),
             (still and ending == ".mp4", "--frame is a still", "end --output with .png or .exr"),
             (self.world and not posed, "--world needs --poses", "give --poses, or omit --world"),
             (

@@ -38,14 +38,7 @@ from cleargs.report.frames import (
     worst_cue,
 )
 from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
-from cleargs.report.report_json import (
-    ENTRY,
-    PAGE,
-    cameras_of,
-    linked_manifests,
-    page_of,
-    write_report_json,
-)
+from cleargs.report.report_json import ENTRY, PAGE, cameras_of, linked_manifests, page_of, write_report_json
 from cleargs.report.single_file import single_file_size
 from cleargs.report.verdict import verdict
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer

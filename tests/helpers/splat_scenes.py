@@ -148,11 +148,7 @@ def compare(
     ours = render(single.to(device), camera, background=BACKGROUND, sh_degree=sh_degree, antialias=antialias)
     ours = Render(*(output.cpu() for output in ours))
     truth = reference.render(
-        double,
-        camera,
-        background=BACKGROUND,
-        sh_count=sh_count(double, sh_degree),
-        antialias=antialias,
+        double, camera, background=BACKGROUND, sh_count=sh_count(double, sh_degree), antialias=antialias
     )
     safe = truth.margin > margin
     generator = torch.Generator().manual_seed(7)

@@ -10,15 +10,7 @@ import pytest
 from OpenImageIO import HALF, ImageBuf, ImageInput
 
 from cleargs.errors import StoreError
-from cleargs.media.exr import (
-    LayeredImage,
-    from_layer,
-    read_depth,
-    read_exr,
-    to_layer,
-    write_depth,
-    write_exr,
-)
+from cleargs.media.exr import LayeredImage, from_layer, read_depth, read_exr, to_layer, write_depth, write_exr
 
 NAMES = ("render", "restored", "fused", "observed")
 

@@ -13,14 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.media.colour import (
-    KNEE,
-    LUMA,
-    linear_from_srgb,
-    srgb_from_hdr,
-    srgb_from_linear,
-    tone_map,
-)
+from cleargs.media.colour import KNEE, LUMA, linear_from_srgb, srgb_from_hdr, srgb_from_linear, tone_map
 from cleargs.media.encode import write_video
 from cleargs.media.video import decode_frames, decode_grey, read_timeline
 

@@ -144,9 +144,7 @@ def test_opposite_signs_of_a_quaternion_are_one_rotation() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(
-    target=st.tuples(*[st.floats(-5, 5)] * 3).map(np.array),
-    first=st.floats(0, 6),
-    count=st.integers(3, 100),
+    target=st.tuples(*[st.floats(-5, 5)] * 3).map(np.array), first=st.floats(0, 6), count=st.integers(3, 100)
 )
 def test_a_turntable_looks_at_the_centre(target: ArrayF64, first: float, count: int) -> None:
     cameras = around(target, first + 2 * np.pi * np.arange(12) / 12)

@@ -13,14 +13,7 @@ import torch
 from cleargs.capture.tables import FRAMES
 from cleargs.digest import file_digest, tree_digest
 from cleargs.formation.exposure import Exposure, write_exposure
-from cleargs.manifest import (
-    FileRecord,
-    KeyParts,
-    Manifest,
-    linked_manifest,
-    published_files,
-    write_manifest,
-)
+from cleargs.manifest import FileRecord, KeyParts, Manifest, linked_manifest, published_files, write_manifest
 from cleargs.media.exr import LayeredImage, to_layer, write_exr
 from cleargs.media.image import write_rgb
 from cleargs.parquet import write_table

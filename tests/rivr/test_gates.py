@@ -80,10 +80,7 @@ def test_a_shift_is_measured(pixels: int, sharp: ImageF32) -> None:
     assert np.median(found) == pytest.approx(pixels, abs=0.2)
 
 
-FOUND = {
-    "shift 4 px": "out of place",
-    **dict.fromkeys(["tint 16%", "half the contrast"], "off colour"),
-}
+FOUND = {"shift 4 px": "out of place", **dict.fromkeys(["tint 16%", "half the contrast"], "off colour")}
 """Those of `FAULTS` that docs/experiments/rivr.md reports as always found -> the gate that finds them."""
 
 

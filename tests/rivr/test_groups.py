@@ -8,15 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from test_stages import (
-    TARGETS,
-    KilledError,
-    capture,
-    digests,
-    dying,
-    expert,
-    make_capture,
-)
+from test_stages import TARGETS, KilledError, capture, digests, dying, expert, make_capture
 from tiny_capture import ROLES, Capture, Sharpen, tiny_consolidate, tiny_g0, tiny_rivr, tried_rows
 
 from cleargs.media.exr import read_exr

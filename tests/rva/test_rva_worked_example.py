@@ -109,11 +109,7 @@ def test_roles_and_weights(result: Assessment) -> None:
 )
 def test_a_share_of_the_frames_is_active(share: float, rule: str, role: str, weight: float) -> None:
     result = assess(
-        FRAME_ID,
-        cues(),
-        POSES,
-        observations_of(POINTS),
-        CONFIG.model_copy(update={"active_share": share}),
+        FRAME_ID, cues(), POSES, observations_of(POINTS), CONFIG.model_copy(update={"active_share": share})
     )
     assert result.reactivated_for.tolist() == ["", "", "", "coverage", rule]
     assert result.role.tolist() == ["strong", "geometric", "auxiliary", "reactivated", role]

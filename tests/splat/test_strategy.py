@@ -9,12 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cleargs.splat.backend import set_threads
-from cleargs.splat.densification import (
-    refine,
-    rotation_matrices,
-    sample_once,
-    sigmoid,
-)
+from cleargs.splat.densification import refine, rotation_matrices, sample_once, sigmoid
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.backend import add_position_noise
 

@@ -598,11 +598,7 @@ def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: P
     config = CONFIG.model_copy(update={"steps": 300, "densify": False, "lr_sh": 1e-3})
     formation = affines(weights, rate=3e-3)
     trained = run(
-        views(darker, weights=weights),
-        tmp_path,
-        config,
-        scene=Scene(gaussians()),
-        formation=formation,
+        views(darker, weights=weights), tmp_path, config, scene=Scene(gaussians()), formation=formation
     )
     exposure = formation.exposure
     assert exposure is not None

@@ -18,13 +18,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.device_layout import PROJECT_BLOCK
 from cleargs.splat.kernels.cuda.gradients import store_triple
-from cleargs.splat.kernels.cuda.projection import (
-    combine,
-    dot,
-    load_triple,
-    rotation_columns,
-    unit_quaternion,
-)
+from cleargs.splat.kernels.cuda.projection import combine, dot, load_triple, rotation_columns, unit_quaternion
 from cleargs.splat.types import Moments
 
 

@@ -108,9 +108,6 @@ def _random(*shape: int, device: torch.device) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0)).to(device)
 
 
-# -- checks ------------------------------------------------------------------------------------------------
-
-
 def render(view: View, backend: Backend, device: torch.device) -> Results:
     """Run a forward and a backward pass."""
     gaussians, camera = view.scene(device)
@@ -251,9 +248,6 @@ def faults(run: Run, gpu: Backend, cpu: Backend, device: torch.device) -> Iterat
             yield f"{name}: {wrong}"
         elif not torch.equal(found, second[name]):
             yield f"{name}: has different bits in two runs on the GPU"
-
-
-# -- pace and memory ---------------------------------------------------------------------------------------
 
 
 def iterate(view: View, repeats: int, backend: Backend, device: torch.device) -> tuple[float, int]:
