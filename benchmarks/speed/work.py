@@ -16,8 +16,8 @@ from numba import prange
 from benchmarks.speed.probe import KERNELS
 from cleargs.splat import constants
 from cleargs.splat.kernels.cpu.jit import kernel
+from cleargs.splat.kernels.cpu.pieces import PIECES
 from cleargs.splat.kernels.cpu.pipeline import CpuForwardPass
-from cleargs.splat.kernels.cpu.rasterise import PIECES
 from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.kernels.splat_layout import BEND_X, BEND_Y, LOG2_OPACITY, MEAN_X, MEAN_Y, SKEW, TILE
 from cleargs.types import AnyArray, ArrayF32

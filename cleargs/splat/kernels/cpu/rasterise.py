@@ -35,6 +35,7 @@ from cleargs.splat.kernels.cpu.pieces import (
     COLUMN_DX,
     EXP2_MIN,
     GEOMETRY_SIZE,
+    PIECES,
     ROW_DY,
     ROW_LOG2,
     ROW_RIDGE,
@@ -45,7 +46,6 @@ from cleargs.splat.kernels.cpu.pieces import (
     set_up_splat,
     splat_offset,
 )
-from cleargs.splat.kernels.cpu.pieces import PIECES as PIECES
 from cleargs.splat.kernels.cpu.simd import (
     LANES,
     any_lane,
