@@ -36,7 +36,7 @@ class ConsolidateConfig(FrozenModel):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 40
+VERSION = 41
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -91,8 +91,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Distil the latest accepted repairs from RIVR's scene and check for harm."""
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.distillation import TrainedScene, publish
-    from cleargs.rivr.harm import judge_harm
+    from cleargs.rivr.distillation import TrainedScene, check_harm, publish
     from cleargs.rivr.rounds import pseudo_view
     from cleargs.rivr.tables import (
         chosen_counts,
@@ -136,11 +135,8 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         )
         trainings.append(consolidated.folder)
 
-    verdict = judge_harm(
-        supervision.holdout_ids,
-        g0.fidelity(supervision.holdout_views, scorer, threads),
-        consolidated.fidelity(supervision.holdout_views, scorer, threads, g0),
-        harm,
+    verdict = check_harm(
+        g0, consolidated, supervision, scorer, harm, threads, repaired=any(row.accepted for row in rows)
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)
     if rejected is not None:

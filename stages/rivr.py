@@ -115,7 +115,7 @@ class RivrConfig(FrozenModel):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 43
+VERSION = 44
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -190,8 +190,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.distillation import TrainedScene, publish
-    from cleargs.rivr.harm import judge_harm
+    from cleargs.rivr.distillation import TrainedScene, check_harm, publish
     from cleargs.rivr.need import frames_to_repair, rows_of_others
     from cleargs.rivr.rounds import Rules, forget_others
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
@@ -234,9 +233,8 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
             "raw frame nor the render (the report shows them); the renders replace them"
         )
 
-    before = g0.fidelity(supervision.holdout_views, rules.primary, threads)
-    after = current.fidelity(supervision.holdout_views, rules.primary, threads, g0)
-    verdict = judge_harm(supervision.holdout_ids, before, after, config.harm)
+    repaired = any(row.accepted for row in rows)
+    verdict = check_harm(g0, current, supervision, rules.primary, config.harm, threads, repaired=repaired)
     if verdict.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")
     final, rejected = (current, None) if verdict.harm is None else (g0, current)

@@ -35,7 +35,8 @@ from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import hide_masked
-from cleargs.rivr.harm import Fidelity
+from cleargs.rivr.harm import Fidelity, HarmConfig, HarmVerdict, judge_harm
+from cleargs.rivr.targets import Supervision
 from cleargs.splat.backend import backend_for, psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig, TrainConfig
@@ -278,6 +279,26 @@ def _deblurred(formed: FormedView, render: Render, observed: ImageF32, mask: Mas
         shown = backend_for(shown.device).apply_affine(shown, formed.affine)
     weight = np.ones(observed.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
     return deblur(shown.clamp(0.0, 1.0).cpu().numpy(), observed, weight, formed.warp(render))
+
+
+def check_harm(
+    g0: TrainedScene,
+    trained: TrainedScene,
+    supervision: Supervision,
+    scorer: Scorer,
+    limits: HarmConfig,
+    threads: int,
+    *,
+    repaired: bool,
+) -> HarmVerdict:
+    """Compare ``trained`` with ``g0`` on the frames held out from repair.
+
+    Without ``repaired`` views the scene was trained on raw frames only, as G0 was. No repair can have done
+    harm then, so nothing is rendered or scored.
+    """
+    views = supervision.holdout_views if repaired else []
+    before, after = g0.fidelity(views, scorer, threads), trained.fidelity(views, scorer, threads, g0)
+    return judge_harm(supervision.holdout_ids, before, after, limits)
 
 
 def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected: TrainedScene | None) -> None:

@@ -324,6 +324,7 @@ def test_where_every_frame_is_kept_the_scene_trains_on_raw_frames(capture: Captu
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     assert len(log["kind"]) == 12 and set(log["kind"]) == {"real"}
     assert (summary["repairs"], summary["chosen"]["observed"]) == (0, len(TARGETS))
+    assert summary["held_back"]["frames"] == []  # no repair can have done harm
 
 
 def test_the_latest_round_decides_whether_a_frame_is_repaired(capture: Capture) -> None:
@@ -448,6 +449,7 @@ def test_a_round_in_which_nothing_is_taken_ends_the_rounds(
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     assert len(log["frame_id"]) == 3 * 12 and set(log["kind"]) == {"real"}
     assert any("no candidate is taken" in line for line in lines)
+    assert result.summary["held_back"]["frames"] == []  # no repair can have done harm
 
 
 def test_consolidation_without_repairs_is_g0_byte_for_byte(capture: Capture) -> None:
