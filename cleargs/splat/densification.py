@@ -3,13 +3,14 @@
 As in that paper, dead Gaussians are relocated, the number of Gaussians grows to a hard budget, and each step
 adds noise to the means of transparent Gaussians. Two rules differ:
 
-- Gaussians are drawn by their error, not by their opacity: by their contribution to the squared error of the
-  frames (Rota Bulò et al., "Revising densification in Gaussian splatting", 2024). Draws by opacity add
-  nothing in dark regions and behind the sparse points.
+- Gaussians are drawn by their error, not by their opacity: by their contribution to the error of the frames
+  (Rota Bulò et al., "Revising densification in Gaussian splatting", 2024). Draws by opacity add nothing in
+  dark regions and behind the sparse points. The error is relative to the contrast of the frame
+  (`relative_error`). Otherwise texture of low contrast would get few Gaussians.
 - A drawn Gaussian is split along its longest axis (Deng et al., "Efficient density control", 2024). Two
   copies at the same place would need many steps to separate.
 
-This module has the rules of a refinement, as pure functions on numpy arrays (on one thread, so that results
+`refine` and what it calls are pure functions on numpy arrays (on one thread, so that results
 do not depend on the number of threads) or on tensors of a GPU: ``xp`` is numpy or torch, whose functions have
 the same names here. The noise is a kernel (`Backend.add_position_noise`).
 """
@@ -21,6 +22,9 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from cleargs.types import AnyArray
 
@@ -44,6 +48,31 @@ as a smear over half of a frame, is split into up to 16."""
 SPLIT_FRACTION = 0.7
 """Offset of the two halves from the centre, and their scale, relative to the scale of the split Gaussian
 along its longest axis. The variance is almost preserved: 0.7² + 0.7² = 0.98."""
+
+CONTRAST_WINDOW = 11
+"""Width of the square window in which the contrast of a frame is measured, pixels."""
+CONTRAST_FLOOR = 0.002
+"""Variance that is added to that of the window. It corresponds to a deviation of 11 of 255."""
+
+
+def relative_error(
+    image: Tensor,  # [H, W, 3] sRGB
+    target: Tensor,  # [H, W, 3] sRGB
+    mask: Tensor | None,  # [H, W] bool, True = counts
+) -> Tensor:
+    """Return squared errors over the variance of ``target`` around each pixel, [H, W, 3] >= 0.
+
+    The variance is the mean of those of the three channels. Masked pixels have no error and do not count in
+    the variances of others. Results do not depend on the number of threads.
+    """
+    counted = torch.ones_like(target[..., :1]) if mask is None else mask[..., None].to(target.dtype)
+    values = torch.cat([target, target.square().mean(dim=-1, keepdim=True), counted], dim=-1)
+    sums = (values * counted).permute(2, 0, 1)
+    for size in ((CONTRAST_WINDOW, 1), (1, CONTRAST_WINDOW)):
+        sums = avg_pool2d(sums, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    means = sums[:4] / sums[4].clamp(min=1e-3)
+    variance = (means[3] - means[:3].square().mean(dim=0)).clamp_(min=0.0)
+    return (image - target).square_().mul_(counted) / (variance + CONTRAST_FLOOR)[..., None]
 
 
 def refine(

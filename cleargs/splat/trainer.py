@@ -29,6 +29,7 @@ from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
 from cleargs.splat.budget import resolve_config, seconds_by_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
+from cleargs.splat.densification import relative_error
 from cleargs.splat.formation import Formation, Formed, recorded
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.interruption import deferred_sigterm
@@ -352,14 +353,12 @@ class Trainer:
     def _error_per_gaussian(
         self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float, formed: Formed | None
     ) -> Tensor:
-        """Return the contribution of each Gaussian to the squared error of a frame, [N] >= 0.
+        """Return the contribution of each Gaussian to the error of a frame, [N] >= 0.
 
         The weight of a Gaussian in a pixel is the derivative of the pixel with respect to its colour, so the
-        backward pass sums weight times squared error over the pixels.
+        backward pass sums weight times error over the pixels.
         """
-        error = (image - target).square_().mul_(weight)
-        if mask is not None:
-            error *= mask[..., None]
+        error = relative_error(image, target, mask).mul_(weight)
         gradients = self._rasteriser.backward(error if formed is None else formed.backward(error))
         return gradients.sh[:, 0].sum(dim=1).clamp_(min=0.0)
 

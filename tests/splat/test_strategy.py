@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cleargs.splat.backend import set_threads
-from cleargs.splat.densification import refine, rotation_matrices, sample_once, sigmoid
+from cleargs.splat.densification import (
+    CONTRAST_FLOOR,
+    refine,
+    relative_error,
+    rotation_matrices,
+    sample_once,
+    sigmoid,
+)
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.backend import add_position_noise
 
@@ -61,6 +68,37 @@ def test_dead_gaussians_become_halves_of_those_with_errors() -> None:
     assert {tuple(row.ravel()) for row in sh} == {tuple(row.ravel()) for row in before["sh"][[10, 20, 30]]}
     assert (sigmoid(grown["logit_opacities"]) > OPEN).all()
     assert (grown["logit_opacities"][[10, 20, 30]] < before["logit_opacities"][[10, 20, 30]]).all()
+
+
+def test_an_error_in_texture_of_low_contrast_counts_more() -> None:
+    """Two textures of which half of the contrast is missing: without the floor they would count alike."""
+    contrast = torch.full((40, 80, 1), 0.02)
+    contrast[:, 40:] = 0.4
+    target = 0.5 + contrast * (torch.rand(40, 80, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
+    image = 0.5 + 0.5 * (target - 0.5)
+    relative, plain = relative_error(image, target, None), (image - target).square()
+    soft, hard = np.s_[:, :30], np.s_[:, 50:]  # windows that see one texture only
+    assert plain[hard].mean() / plain[soft].mean() == pytest.approx(400.0, rel=0.05)
+    # The textures' variances are 0.02² / 12 and 0.4² / 12. 0.02 would be counted 400 times too little.
+    expected = 400.0 * (0.02**2 / 12 + CONTRAST_FLOOR) / (0.4**2 / 12 + CONTRAST_FLOOR)
+    assert relative[hard].mean() / relative[soft].mean() == pytest.approx(expected, rel=0.05)
+    constant = torch.full((20, 20, 3), 0.3)
+    assert relative_error(constant + 0.1, constant).flatten().tolist() == pytest.approx(
+        [5.0] * 1200, rel=1e-3
+    )
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_relative_errors_do_not_depend_on_threads(threads: int) -> None:
+    images = torch.rand(2, 97, 131, 3, generator=torch.Generator().manual_seed(0))
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        alone = relative_error(*images, None)
+        torch.set_num_threads(threads)
+        assert torch.equal(relative_error(*images, None), alone)
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("condition", ["is alive", "has errors"])
