@@ -83,7 +83,7 @@ def test_an_error_in_texture_of_low_contrast_counts_more() -> None:
     expected = 400.0 * (0.02**2 / 12 + CONTRAST_FLOOR) / (0.4**2 / 12 + CONTRAST_FLOOR)
     assert relative[hard].mean() / relative[soft].mean() == pytest.approx(expected, rel=0.05)
     constant = torch.full((20, 20, 3), 0.3)
-    assert relative_error(constant + 0.1, constant).flatten().tolist() == pytest.approx(
+    assert relative_error(constant + 0.1, constant, None).flatten().tolist() == pytest.approx(
         [5.0] * 1200, rel=1e-3
     )
 
