@@ -83,9 +83,21 @@ def test_an_error_in_texture_of_low_contrast_counts_more() -> None:
     expected = 400.0 * (0.02**2 / 12 + CONTRAST_FLOOR) / (0.4**2 / 12 + CONTRAST_FLOOR)
     assert relative[hard].mean() / relative[soft].mean() == pytest.approx(expected, rel=0.05)
     constant = torch.full((20, 20, 3), 0.3)
-    assert relative_error(constant + 0.1, constant, None).flatten().tolist() == pytest.approx(
-        [5.0] * 1200, rel=1e-3
-    )
+    even = relative_error(constant + 0.1, constant, None)
+    assert even.flatten().tolist() == pytest.approx([0.1**2 / CONTRAST_FLOOR] * 1200, rel=1e-3)
+
+
+def test_masked_pixels_do_not_change_relative_errors() -> None:
+    """A bright thing behind a mask has no error, and gives its neighbours no contrast."""
+    target = torch.rand(30, 40, 3, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(30, 40, dtype=torch.bool)
+    mask[10:20, 10:20] = False
+    changed = target.masked_fill(~mask[..., None], 5.0)
+    found = relative_error(target + 0.1, changed, mask)
+    torch.testing.assert_close(found, relative_error(target + 0.1, target, mask), rtol=0, atol=0)
+    assert (found[~mask] == 0.0).all() and (found[mask] > 0.0).all()
+    nothing = relative_error(target, changed, torch.zeros_like(mask))
+    assert (nothing == 0.0).all()
 
 
 @pytest.mark.parametrize("threads", [2, 3])
