@@ -186,15 +186,14 @@ class CaptureFormation:
                 doubted=self._weights[frame_id] < DOUBTED,
                 rolling=self._rolls(),
                 again=_searched_again(frame.draws // self._config.every),
-                test_rolling=frame_id in self._tested and frame.skew_gain is None,
+                test_rolling=self._asks(frame_id),
                 draft=self._draft or self._sharp(),
             )
 
         begun = progress >= self._config.start
         searched = self._config.enabled and view.kind == "real"
         if searched and not begun:
-            untested = frame_id in self._tested and self._frames[frame_id].skew_gain is None
-            if progress >= ROLLING_START and untested and not self._rolls():
+            if progress >= ROLLING_START and self._asks(frame_id) and not self._rolls():
                 gain = explained().skew_gain
                 self._frames[frame_id] = replace(self._frames[frame_id], skew_gain=gain)
             searched = self._rolls()
@@ -266,6 +265,16 @@ class CaptureFormation:
 
     def _rolls(self) -> bool:
         return rolls(self._frames.values())
+
+    def _asks(self, frame_id: int) -> bool:
+        """Return True if a frame is still to be tested for a rolling shutter.
+
+        Once more than half of the tested frames show none, the others cannot change the median.
+        """
+        if frame_id not in self._tested or self._frames[frame_id].skew_gain is not None:
+            return False
+        gains = [self._frames[k].skew_gain for k in self._tested]
+        return 2 * sum(gain is not None and gain <= ROLLING for gain in gains) <= len(gains)
 
     def _due(self, frame_id: int) -> bool:
         """Return True if the formation of a frame is estimated before the next step on it."""

@@ -217,6 +217,11 @@ class Level:
         )
 
 
+def finest_level(pair: FramePair) -> Level:
+    """Return the problem at the largest size at which a frame is compared."""
+    return Level(pair, scales(pair)[-1])
+
+
 def _holdout_mask(shape: tuple[int, ...]) -> MaskBool:
     """Return a mask [H, W] of every fourth block, no two of which share a side."""
     row, column = (np.arange(side) // HOLDOUT_BLOCK for side in shape)

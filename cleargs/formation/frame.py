@@ -12,7 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit, explained_share, luminance
+from cleargs.formation.comparison import (
+    MIN_MISFIT,
+    FramePair,
+    MotionFit,
+    explained_share,
+    finest_level,
+    luminance,
+)
 from cleargs.formation.motion import MODELS, TWISTS, FrameMotion, Model, widened
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
 from cleargs.formation.search import blur_along, preferred, refine, search
@@ -27,6 +34,10 @@ from cleargs.splat.types import Render
 EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
 """Share of the squared error on unseen tiles that further blur must explain before a frame is searched; the
 second holds for frames that RVA doubts. Both are from tuning captures (docs/experiments/formation.md)."""
+WORSE = -0.03
+"""Share of the misfit that half of the tested blur must explain before a frame without a model is searched.
+Wrong geometry can pass for a blur in the test, but a blur makes the render less like such a frame.
+Source: docs/experiments/formation.md."""
 GROWN_EVIDENCE = 1.25
 """Factor by which that share must have grown since the last search before a frame is searched again."""
 SEARCHED_SHARE = 0.05
@@ -139,7 +150,8 @@ def fit_motion(
     asked = first or untested or test_rolling or again or not _admitted(frame.model, rolling)
     enough = max(DOUBTED_EVIDENCE if doubted else EVIDENCE, GROWN_EVIDENCE * frame.evidence)
     left = min(frame.evidence, evidence.gain)
-    if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
+    blurred = evidence.gain > enough and best.misfit > MIN_MISFIT
+    if asked or (blurred and (best.model != "none" or _resembled(pair, evidence))):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
         if wide > margin:
             margin, rendered = wide, render(widened(camera, wide))
@@ -149,7 +161,7 @@ def fit_motion(
             pair,
             start=None if skews else blur_along(whole.length, whole.angle),
             skew=skews,
-            defocus=skews or whole.disc_gain > whole.line_gain,
+            defocus=rolling or whole.disc_gain > whole.line_gain,
             pose=pose,
         )
         if skews:
@@ -182,6 +194,13 @@ def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvide
     elif pair.margin:
         shown = shown[pair.margin : -pair.margin, pair.margin : -pair.margin]
     return blur_evidence(np.ascontiguousarray(shown), pair.observed, pair.weight)
+
+
+def _resembled(pair: FramePair, evidence: BlurEvidence) -> bool:
+    """Return True unless half of the blur that the test found makes the render less like the frame."""
+    level = finest_level(pair)
+    blur = replace(blur_along(0.5 * evidence.length, evidence.angle), median_depth=level.median)
+    return level.evaluate("blur", blur).explained > WORSE
 
 
 def _admitted(model: Model, rolling: bool) -> bool:

@@ -12,7 +12,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.comparison import COARSE, DISC, LEVELS, FramePair, Level, MotionFit, scales
+from cleargs.formation.comparison import (
+    COARSE,
+    DISC,
+    LEVELS,
+    FramePair,
+    Level,
+    MotionFit,
+    finest_level,
+    scales,
+)
 from cleargs.formation.motion import BEND, BLUR, CUBE, POSE, SKEW, TWIST, TWISTS, FrameMotion, Model
 from cleargs.types import ArrayF64
 
@@ -84,13 +93,13 @@ def search(
     for model in models:
         straight = curved = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
-            straight = _best(level, [straight, still], model, steps, pose)
-            if level is levels[-1] or BLUR not in _ACTIVE[model]:
-                continue
-            if (best := _promising(level, [straight, curved], still)) is not None:
+            nearer = min((straight, still), key=level.cost)
+            straight = _best(level, [nearer], model, steps, pose)
+            best = _promising(level, [straight, curved], still) if BLUR in _ACTIVE[model] else None
+            if best is not None and level is not levels[-1]:
                 curved = _best(level, [best], model, steps, pose, MAX_ORDER)
         found.append((model, straight))
-        if straight.blur.any() or curved.blur.any():
+        if best is not None and (straight.blur.any() or curved.blur.any()):
             paths = [_best(level, [straight], model, steps, pose, 2)]
             if (best := _promising(level, [*paths, curved], still)) is not None:
                 paths.append(_best(level, [best], model, steps, pose, MAX_ORDER))
@@ -113,7 +122,7 @@ def refine(
     Returns:
         The fit of ``none`` first, then that of ``model`` where it is another, then that of the next order.
     """
-    level = Level(pair, scales(pair)[-1])
+    level = finest_level(pair)
     if model == "none":
         return [level.evaluate("none", FrameMotion())]
     still = FrameMotion(median_depth=level.median)
