@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
 from cleargs.progress import Reporter
-from cleargs.render.output import Shot, kind_of, require_free, write_shots
+from cleargs.render.output import Kind, Shot, kind_of, require_free, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.safe_io import FAULTS, cause, read_json
 from cleargs.splat.camera import Camera
@@ -95,85 +95,55 @@ def render_run(
         InputError: an option cannot be used, or ``output`` exists and is not to be replaced.
     """
     options.check(output)
-    kind = kind_of(output)
     require_free(output, force=force)
-    ingest = scene.parents[1] / "ingest"
-    capture = CaptureShots(ingest, options.size, even=kind == "film", side_by_side=options.side_by_side)
-    count = max(2, round(options.fps * (options.seconds or SECONDS)))
-    if options.poses is not None:
-        shots = capture.poses(options.poses, options.world)
-    elif options.turntable:
-        shots = capture.turntable(count)
-    elif options.frame is not None or kind == "still":
-        shots = capture.still(options.frame)
-    else:
-        shots = capture.path(count)
+    shots = _shots(scene.parents[1] / "ingest", options, kind_of(output))
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
         write_shots(output, read_ply(scene), shots, task, fps=options.fps, codec=options.codec, device=device)
     return shots
 
 
-class CaptureShots:
-    """Creates shots from the frames with a pose in the prepared capture ``ingest``.
+def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
+    """Return the shots of the prepared capture ``ingest``, all of one size.
 
-    Images have the ``size`` (None: that of the frames, one pixel more where ``even`` needs it). The raw frame
-    is ``side_by_side`` with the render, where there is one. Raises InputError if no frame has a pose.
+    It is that of the frames where ``options`` have none, one pixel more where a film needs an even number.
+    Raises InputError if no frame has a pose.
     """
-
-    def __init__(self, ingest: Path, size: Size | None, *, even: bool, side_by_side: bool) -> None:
-        self._ingest, self._size, self._even, self._side_by_side = ingest, size, even, side_by_side
-        self._all = load_frames(ingest)
-        self._frames = [frame for frame in self._all if frame.registered]
-        if not self._frames:
-            raise InputError("no frame of this capture has a pose", hint="see cleargs show RUN ingest")
-        self._cameras = [view_of(frame, ingest, 0.0).camera for frame in self._frames]
-        self._lens = self._cameras[len(self._cameras) // 2]
-
-    def still(self, frame_id: int | None) -> list[Shot]:
-        """Return a shot at the pose of a frame (None: the frame in the middle of the capture)."""
-        numbers = [frame.frame_id for frame in self._frames]
-        number = numbers[len(numbers) // 2] if frame_id is None else frame_id
+    listed = load_frames(ingest)
+    frames = [frame for frame in listed if frame.registered]
+    if not frames:
+        raise InputError("no frame of this capture has a pose", hint="see cleargs show RUN ingest")
+    own = [view_of(frame, ingest, 0.0).camera for frame in frames]
+    lens = own[len(own) // 2]
+    count = max(2, round(options.fps * (options.seconds or SECONDS)))
+    filmed: list[Frame] = []
+    if options.poses is not None:
+        manifest = linked_manifest(ingest.parent, ingest.name)
+        similarity = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
+        cameras = read_poses(options.poses, lens, similarity, options.world)
+    elif options.turntable:
+        cameras = [replace(lens, world_to_camera=pose) for pose in turntable(own, count)]
+    elif options.frame is not None or kind == "still":
+        numbers = [frame.frame_id for frame in frames]
+        number = numbers[len(numbers) // 2] if options.frame is None else options.frame
         if number not in numbers:
-            exists = any(frame.frame_id == number for frame in self._all)
+            exists = any(frame.frame_id == number for frame in listed)
             raise InputError(
                 f"frame {number} {'has no pose' if exists else 'is not in this capture'}",
                 hint=f"choose one from {numbers[0]} to {numbers[-1]}",
             )
         index = numbers.index(number)
-        return self._shots([self._cameras[index]], [self._frames[index]])
-
-    def path(self, count: int) -> list[Shot]:
-        """Return ``count`` shots at equal steps along the smoothed path of the capture."""
-        poses, nearest = smooth_path(self._cameras, count)
-        cameras = [replace(self._lens, world_to_camera=pose) for pose in poses]
-        return self._shots(cameras, [self._frames[index] for index in nearest])
-
-    def turntable(self, count: int) -> list[Shot]:
-        """Return ``count`` shots around the point that the cameras look at."""
-        poses = turntable(self._cameras, count)
-        return self._shots([replace(self._lens, world_to_camera=pose) for pose in poses])
-
-    def poses(self, path: Path, world: World | None) -> list[Shot]:
-        """Return one shot per pose in the file ``path``; see `read_poses`."""
-        manifest = linked_manifest(self._ingest.parent, self._ingest.name)
-        similarity = Similarity.from_json(manifest and manifest.summary.get("similarity"), self._ingest)
-        return self._shots(read_poses(path, self._lens, similarity, world))
-
-    def _shots(self, cameras: Sequence[Camera], filmed: Sequence[Frame] = ()) -> list[Shot]:
-        """Return shots of one size, with the frames ``filmed`` next to them if the user wants that."""
-        width, height = self._size or (cameras[0].width, cameras[0].height)
-        if self._size is None and self._even:
-            width, height = width + width % 2, height + height % 2
-        if width * height > MAX_PIXELS:
-            raise InputError(
-                f"an image of {width}x{height} pixels is too large", hint="give a smaller --size"
-            )
-        images = (
-            [self._ingest / frame.image for frame in filmed] if self._side_by_side else [None] * len(cameras)
-        )
-        return [
-            Shot(framed(camera, width, height), image) for camera, image in zip(cameras, images, strict=True)
-        ]
+        cameras, filmed = [own[index]], [frames[index]]
+    else:
+        poses, nearest = smooth_path(own, count)
+        cameras = [replace(lens, world_to_camera=pose) for pose in poses]
+        filmed = [frames[index] for index in nearest]
+    width, height = options.size or (cameras[0].width, cameras[0].height)
+    if options.size is None and kind == "film":
+        width, height = width + width % 2, height + height % 2
+    if width * height > MAX_PIXELS:
+        raise InputError(f"an image of {width}x{height} pixels is too large", hint="give a smaller --size")
+    images = [ingest / frame.image for frame in filmed] if options.side_by_side else [None] * len(cameras)
+    return [Shot(framed(camera, width, height), image) for camera, image in zip(cameras, images, strict=True)]
 
 
 def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | None = None) -> list[Camera]:
