@@ -57,7 +57,7 @@ def shown_advice(
     planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
 ) -> list[Advice]:
     """Return all advice on a run, the most useful first. Holding out frames is never the only command."""
-    found = sorted(_Advisor(planner, manifests, rows).advice(), key=lambda advice: -advice.worth)
+    found = sorted(_advice(planner, manifests, rows), key=lambda advice: -advice.worth)
     if not any(advice.options and advice.worth for advice in found):
         found = [advice for advice in found if advice.worth]
     return [
@@ -128,106 +128,98 @@ def _time(planner: Planner, options: Sequence[str]) -> str:
     return f"about {max(1, round(sum(costs)))} min" if costs else ""
 
 
-class _Advisor:
-    """The advice on one run."""
+def _advice(
+    planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
+) -> Iterator[Advice]:
+    """Yield all advice on a run, in the order of the stages."""
+    for manifest in manifests.values():
+        for missing in manifest.missing:
+            yield Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
+    yield from _on_frames(planner.run.config, manifests, rows)
+    if "g0" in manifests:
+        yield from _on_training(planner, manifests, rows)
 
-    def __init__(self, planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> None:
-        self._config, self._dag = planner.run.config, planner.dag
-        self._manifests, self._rows = manifests, rows
 
-    def _figure(self, stage: str, *path: str) -> Any:
-        return figure_of(self._manifests, stage, *path)
+def _on_frames(
+    config: Config, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
+) -> Iterator[Advice]:
+    ingest: Any = config.sections["ingest"]
+    unplaced = sum(row.role == UNPLACED for row in rows)
+    available = figure_of(manifests, "ingest", "frames_available") or 0
+    more: dict[str, Any] = {}  # the setting that limits the number of frames, if the capture has more
+    if available > len(rows):
+        if ingest.fps is not None and len(rows) < ingest.max_frames:
+            more = {"ingest.fps": 2 * ingest.fps}
+        else:
+            more = {"ingest.max_frames": min(available, 2 * len(rows))}
+    if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
+        all_pairs = len(rows) < ingest.exhaustive_below
+        overlap = {} if all_pairs else {"ingest.overlap": 2 * ingest.overlap}
+        yield Advice(
+            f"{count(unplaced, 'frame has', 'frames have')} no pose",
+            "They share too few points with their neighbours: they are too blurred or too far apart.",
+            f"up to {count(unplaced, 'frame')} more" if more or overlap else "",
+            5.0,
+            tuple(_set(more | overlap)),
+        )
+    elif available > 1.5 * len(rows):
+        yield Advice(
+            f"{len(rows)} of {available} frames were used",
+            "More frames show each surface from more views.",
+            "+1.8 dB at new views on one capture (292 frames in place of 150)",
+            1.0,
+            tuple(_set(more)),
+        )
+    if rows and not any(row.role == HELD_OUT for row in rows):
+        yield Advice(
+            "No frame was held out",
+            "All figures here are for frames that the scene was trained on.",
+            "no better scene, but a figure for new views",
+            0.0,
+            ("--set", "ingest.holdout=every:8"),
+        )
+    blurred = sum((row.motion("blur_px") or 0.0) > BLURRED_PX for row in rows)
+    if blurred > len(rows) / 2:
+        what = f"{count(blurred, 'frame has', 'frames have')} more than {BLURRED_PX:g} px of motion blur"
+        why = "A shorter exposure or slower camera motion gives sharper frames than any repair."
+        yield Advice(what, why, NO_FIGURE, 0.5)
 
-    def _setting(self, section: str, name: str) -> Any:
-        return getattr(self._config.sections[section], name)
 
-    def advice(self) -> Iterator[Advice]:
-        """Yield all advice, in the order of the stages."""
-        for manifest in self._manifests.values():
-            for missing in manifest.missing:
-                yield Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
-        yield from self._on_frames()
-        if "g0" in self._manifests:
-            yield from self._on_training()
-
-    def _on_frames(self) -> Iterator[Advice]:
-        rows = self._rows
-        unplaced = sum(row.role == UNPLACED for row in rows)
-        available = self._figure("ingest", "frames_available") or 0
-        more: dict[str, Any] = {}  # the setting that limits the number of frames, if the capture has more
-        if available > len(rows):
-            fps = self._setting("ingest", "fps")
-            if fps is not None and len(rows) < self._setting("ingest", "max_frames"):
-                more = {"ingest.fps": 2 * fps}
-            else:
-                more = {"ingest.max_frames": min(available, 2 * len(rows))}
-        if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
-            all_pairs = len(rows) < self._setting("ingest", "exhaustive_below")
-            overlap = {} if all_pairs else {"ingest.overlap": 2 * self._setting("ingest", "overlap")}
-            yield Advice(
-                f"{count(unplaced, 'frame has', 'frames have')} no pose",
-                "They share too few points with their neighbours: they are too blurred or too far apart.",
-                f"up to {count(unplaced, 'frame')} more" if more or overlap else "",
-                5.0,
-                tuple(_set(more | overlap)),
-            )
-        elif available > 1.5 * len(rows):
-            yield Advice(
-                f"{len(rows)} of {available} frames were used",
-                "More frames show each surface from more views.",
-                "+1.8 dB at new views on one capture (292 frames in place of 150)",
-                1.0,
-                tuple(_set(more)),
-            )
-        if rows and not any(row.role == HELD_OUT for row in rows):
-            yield Advice(
-                "No frame was held out",
-                "All figures here are for frames that the scene was trained on.",
-                "no better scene, but a figure for new views",
-                0.0,
-                ("--set", "ingest.holdout=every:8"),
-            )
-        blurred = sum((row.motion("blur_px") or 0.0) > BLURRED_PX for row in self._rows)
-        if blurred > len(self._rows) / 2:
-            what = f"{count(blurred, 'frame has', 'frames have')} more than {BLURRED_PX:g} px of motion blur"
-            why = "A shorter exposure or slower camera motion gives sharper frames than any repair."
-            yield Advice(what, why, NO_FIGURE, 0.5)
-
-    def _on_training(self) -> Iterator[Advice]:
-        yield from self._on_steps()
-        spread = self._figure("g0", "exposure_spread") or 0.0
-        if spread > self._setting("g0", "exposure_threshold") and not self._figure("g0", "exposure"):
-            what = f"Exposure differs by {100 * spread:.0f} % between frames"
-            why = "Without compensation the scene averages the exposures, which causes floating haze."
-            yield Advice(what, why, NO_FIGURE, 0.8, tuple(_set({"g0.exposure": "auto"})))
-
-    def _on_steps(self) -> Iterator[Advice]:
-        steps, quality = self._figure("g0", "steps") or 0, self._setting("g0", "quality")
-        standard = steps_from_frames(sum(bool(row.weight) for row in self._rows))
-        size = self._setting("ingest", "max_size")
-        recipe, changed = _nearest_recipe(self._config, self._dag)
-        named = self._setting("g0", "steps") is not None or recipe != "default"
-        if steps < SHORT * standard:
-            own = {name: value for name, value in changed.items() if name.startswith(("ingest.", "rva."))}
-            reset = ("--reset", *_set(own)) if named else ()
-            yield Advice(
-                f"The training was short: {steps:,} of {standard:,} steps at {size} px",
-                "Longer training gives finer detail.",
-                "+0.8 to 2.2 dB at new views (draft against standard, four captures)",
-                1.5,
-                (*reset, "--quality", "standard"),
-            )
-        elif quality == "standard" and not named:
-            yield Advice(
-                "The training can be longer",
-                "High quality takes four times the steps and twice the Gaussians.",
-                "+0.4 to 0.9 dB at new views on three captures, none on a fourth",
-                0.6,
-                ("--quality", "high"),
-            )
-        if steps >= SHORT * standard and any(
-            size in (row.frame.width, row.frame.height) for row in self._rows
-        ):
-            why = "Larger images show finer detail, if the video has it."
-            larger = tuple(_set({"ingest.max_size": size * 3 // 2}))
-            yield Advice(f"Images were reduced to {size} px", why, NO_FIGURE, 0.5, larger)
+def _on_training(
+    planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
+) -> Iterator[Advice]:
+    config = planner.run.config
+    g0: Any = config.sections["g0"]
+    ingest: Any = config.sections["ingest"]
+    size = ingest.max_size
+    steps = figure_of(manifests, "g0", "steps") or 0
+    standard = steps_from_frames(sum(bool(row.weight) for row in rows))
+    recipe, changed = _nearest_recipe(config, planner.dag)
+    named = g0.steps is not None or recipe != "default"
+    if steps < SHORT * standard:
+        own = {name: value for name, value in changed.items() if name.startswith(("ingest.", "rva."))}
+        reset = ("--reset", *_set(own)) if named else ()
+        yield Advice(
+            f"The training was short: {steps:,} of {standard:,} steps at {size} px",
+            "Longer training gives finer detail.",
+            "+0.8 to 2.2 dB at new views (draft against standard, four captures)",
+            1.5,
+            (*reset, "--quality", "standard"),
+        )
+    elif g0.quality == "standard" and not named:
+        yield Advice(
+            "The training can be longer",
+            "High quality takes four times the steps and twice the Gaussians.",
+            "+0.4 to 0.9 dB at new views on three captures, none on a fourth",
+            0.6,
+            ("--quality", "high"),
+        )
+    if steps >= SHORT * standard and any(size in (row.frame.width, row.frame.height) for row in rows):
+        why = "Larger images show finer detail, if the video has it."
+        larger = tuple(_set({"ingest.max_size": size * 3 // 2}))
+        yield Advice(f"Images were reduced to {size} px", why, NO_FIGURE, 0.5, larger)
+    spread = figure_of(manifests, "g0", "exposure_spread") or 0.0
+    if spread > g0.exposure_threshold and not figure_of(manifests, "g0", "exposure"):
+        what = f"Exposure differs by {100 * spread:.0f} % between frames"
+        why = "Without compensation the scene averages the exposures, which causes floating haze."
+        yield Advice(what, why, NO_FIGURE, 0.8, tuple(_set({"g0.exposure": "auto"})))
