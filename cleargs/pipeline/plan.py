@@ -49,11 +49,6 @@ class StageKey:
     inherited: tuple[str, ...]
     """Outputs that are missing upstream, one line each."""
 
-    @property
-    def key(self) -> str:
-        """The key of the stage's results."""
-        return self.parts.key
-
 
 @dataclass(frozen=True)
 class StagePlan:
@@ -73,7 +68,7 @@ class StagePlan:
     @property
     def key(self) -> str | None:
         """The key of the stage; None until the upstream stages are done."""
-        return self.stage_key.key if self.stage_key is not None else None
+        return self.stage_key.parts.key if self.stage_key is not None else None
 
 
 @dataclass
@@ -264,7 +259,7 @@ class Planner:
                 plans.append(StagePlan(name, "missing", (reason,), self.estimate(name, done)))
                 continue
             stage_key = self.stage_key(name, done)
-            entry = self.store.find(name, stage_key.key)
+            entry = self.store.find(name, stage_key.parts.key)
             usable = entry.usable if entry is not None else None
             if name in force or usable is None:
                 reasons = ("forced",) if name in force else self.reasons(stage_key, entry)

@@ -167,15 +167,15 @@ class Runner:
         self, name: str, done: Mapping[str, Manifest], *, forced: bool
     ) -> StageOutcome:
         stage_key = self.planner.stage_key(name, done)
-        entry = self.store.find(name, stage_key.key)
+        entry = self.store.find(name, stage_key.parts.key)
         manifest = entry.complete if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
             stage_key = self._rehashed_key(name, done)
-            entry = self.store.find(name, stage_key.key)
+            entry = self.store.find(name, stage_key.parts.key)
             reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
-            with self.store.lock(stage_key.key, self.reporter, name) as locked:
-                entry = self.store.find(name, stage_key.key)
+            with self.store.lock(stage_key.parts.key, self.reporter, name) as locked:
+                entry = self.store.find(name, stage_key.parts.key)
                 if entry is not None and entry.damage is not None:
                     self.reporter.warn(
                         f"{name}: the stored results are damaged ({entry.damage}); the stage runs again"
@@ -187,9 +187,9 @@ class Runner:
                     self.reporter.info(f"{name}: started{because}")
                     manifest, how = self._make(stage_key, entry, forced=forced, locked=locked), "made"
         manifest = self._with_inherited(manifest, stage_key.inherited)
-        self.store.link(self.run.folder, name, stage_key.key)
+        self.store.link(self.run.folder, name, stage_key.parts.key)
         self._link_scene()
-        return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.key))
+        return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.parts.key))
 
     def _rehashed_key(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
         """Return the key of ``name`` after reading all inputs again: a failing disk keeps time stamps.
@@ -213,7 +213,7 @@ class Runner:
         name = stage_key.parts.stage
         stage = self.dag.load(name)
         work = self.store.open_work(
-            stage_key.key, forced=forced, entry=entry, leftovers=stage.LEFTOVERS, locked=locked
+            stage_key.parts.key, forced=forced, entry=entry, leftovers=stage.LEFTOVERS, locked=locked
         )
         context = self.planner.context(name, stage_key.inputs, work)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
@@ -250,7 +250,7 @@ class Runner:
         }
         manifest = Manifest(
             stage=name,
-            key=stage_key.key,
+            key=stage_key.parts.key,
             status="partial" if result.missing or stage_key.inherited else "complete",
             missing=result.missing,
             inherited=stage_key.inherited,
