@@ -28,7 +28,7 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import opened_store
-from cleargs.report.report_json import ENTRY
+from cleargs.report.report_json import ENTRY, is_current, linked_manifests, page_of
 
 
 @click.command(
@@ -91,8 +91,6 @@ def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path
     Returns:
         The page, or None if no frames exist or writing failed (with a warning).
     """
-    from cleargs.report.report_json import is_current, linked_manifests, page_of
-
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
@@ -110,8 +108,6 @@ def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path
 
 def outdated_report_note(run: Path, dag: Dag) -> str:
     """Return a note if the report of ``run`` shows earlier results, or "" otherwise."""
-    from cleargs.report.report_json import is_current, linked_manifests, page_of
-
     page = page_of(run)
     if not page.is_file() or is_current(run, linked_manifests(run, dag.names)):
         return ""
