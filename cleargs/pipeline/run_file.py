@@ -62,10 +62,8 @@ def write_run_file(run: RunSpec) -> None:
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
     document["seed"] = run.config.seed
-    path, text = (
-        run.folder / RUN_FILE,
-        (HEADER + tomli_w.dumps(document) + _settings_toml(run.config)).encode(),
-    )
+    path = run.folder / RUN_FILE
+    text = (HEADER + tomli_w.dumps(document) + _settings_toml(run.config)).encode()
     with disk_errors(path):
         run.folder.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.read_bytes() != text:

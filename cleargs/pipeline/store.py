@@ -21,7 +21,7 @@ import os
 import shutil
 import socket
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -125,17 +125,14 @@ class Store:
             return Entry(folder, None, "the manifest belongs to another folder")
         return Entry(folder, manifest, next(damages(folder, manifest, manifest.files, self.memo), None))
 
-    @contextmanager
-    def in_use(self) -> Iterator[None]:
+    def in_use(self) -> AbstractContextManager[object]:
         """Hold a shared lock, so that ``cleargs gc`` in another process cannot remove data in use.
 
         A read-only store has no lock. Its results can still be shown.
         """
         if self._only_readable():
-            yield
-            return
-        with file_lock(self.root / "locks" / "store.lock", shared=True):
-            yield
+            return nullcontext()
+        return file_lock(self.root / "locks" / "store.lock", shared=True)
 
     @contextmanager
     def lock(self, key: str, reporter: Reporter, stage: str) -> Iterator[bool]:
