@@ -44,11 +44,10 @@ class IngestConfig(SfmConfig, CaptureConfig):
     @classmethod
     def _known_holdout(cls, value: str) -> str:
         # Letters before a colon are meant for a rule; a frame may be named by a time of day.
-        if re.match(r"[A-Za-z]+:", value) and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
-            raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
+        unknown = re.match(r"[A-Za-z]+:", value) and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value)
         if value in ("every:1", "sharpest:1"):
             raise ValueError(f"{value} would hold out every frame")
-        if not value.strip(" ,"):
+        if unknown or not value.strip(" ,"):
             raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
         return value
 
@@ -64,11 +63,8 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     """Return the settings within the limits of a draft, where the run is one."""
     if getattr(sections.get("g0"), "quality", None) != "draft":
         return config
-    limits = {
-        "max_frames": min(config.max_frames, DRAFT_FRAMES),
-        "max_size": min(config.max_size, DRAFT_SIZE),
-    }
-    return config.model_copy(update=limits)
+    frames, size = min(config.max_frames, DRAFT_FRAMES), min(config.max_size, DRAFT_SIZE)
+    return config.model_copy(update={"max_frames": frames, "max_size": size})
 
 
 VERSION = 15
@@ -117,10 +113,9 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
     distant = count * (2 * config.overlap + config.loop_candidates)
     pairs = count * (count - 1) / 2 if count < config.exhaustive_below else distant
     megapixels = megapixels_at(max(config.feature_size, config.max_size))
-    needs_poses = capture.model is None
     alone = _FRAME_S * megapixels * count
     parallel = 0.0
-    if needs_poses:
+    if needs_poses := capture.model is None:
         alone += _START_S
         parallel += count * (_FEATURES_S + _FEATURES_S_PER_MEGAPIXEL * megapixels)
         matched = min(megapixels, config.max_features / _FEATURES_PER_MEGAPIXEL)
