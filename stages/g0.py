@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -13,11 +13,6 @@ from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig
 
 from .config import G0_END, TRAINED
-
-if TYPE_CHECKING:
-    from cleargs.formation.exposure import Exposure
-    from cleargs.splat.initialise import SparsePoints
-    from cleargs.splat.views import TrainingView
 
 
 class G0Config(TrainConfig):
@@ -105,7 +100,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.capture.folders import spread
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
-    from cleargs.formation.exposure import Exposure, write_exposure
+    from cleargs.formation.exposure import Exposure, frame_gains, gain_spread, write_exposure
     from cleargs.formation.frames import real_views
     from cleargs.formation.movement import TOLERANCE, write_movement
     from cleargs.formation.observed import MAX_EVALUATED, evaluate_views, pooled_unseen
@@ -141,7 +136,11 @@ def run(context: StageContext[G0Config]) -> StageResult:
         seed=context.seed,
         say=lambda remark: context.reporter.info(f"G0: {remark}"),
     )
-    exposure, exposure_spread = _exposure(config, views, sparse)
+    gains = frame_gains(views, sparse)
+    exposure_spread = gain_spread(gains)
+    alike = exposure_spread <= config.exposure_threshold
+    off = config.exposure == "off" or (config.exposure == "auto" and alike)
+    exposure = None if off else Exposure.from_gains(frame_ids, gains)
     formation = CaptureFormation(
         views,
         config.formation,
@@ -160,7 +159,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
     checkpoint = context.checkpoints / "g0.safetensors"
     trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
-    learned = formation.exposure or Exposure.identity([view.frame_id for view in views])
+    learned = formation.exposure or Exposure.identity(frame_ids)
     moving = formation.moving
     few = spread(views, MAX_EVALUATED)
     fits = evaluate_views(trained.scene.to(context.device), few, learned, formation.frames, moving=moving)
@@ -189,19 +188,6 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "psnr_unseen": pooled_unseen(fits),
         }
     )
-
-
-def _exposure(
-    config: G0Config, views: list[TrainingView], sparse: SparsePoints
-) -> tuple[Exposure | None, float]:
-    """Return affines to learn, or None, and the spread of the frames' gains."""
-    from cleargs.formation.exposure import Exposure, frame_gains, gain_spread
-
-    gains = frame_gains(views, sparse)
-    spread = gain_spread(gains)
-    if config.exposure == "off" or (config.exposure == "auto" and spread <= config.exposure_threshold):
-        return None, spread
-    return Exposure.from_gains([view.frame_id for view in views], gains), spread
 
 
 def movement_expected(config: G0Config, allocation: Sequence[Mapping[str, Any]]) -> bool:

@@ -49,10 +49,9 @@ def estimate(context: StageContext[RvaConfig]) -> Estimate:
 
     config = context.config
     frames, megapixels = capture_size(context)
-    if config.evaluator != "qwen3-vl":
-        seconds = _SECONDS_PER_MEGAPIXEL * megapixels * frames / context.threads
-        return Estimate(minutes=seconds / 60, memory_gb=0.3, disk_gb=0.001)
-    minutes = frames / (_REPLIES_PER_MINUTE * config.qwen.concurrency)
+    minutes = _SECONDS_PER_MEGAPIXEL * megapixels * frames / context.threads / 60
+    if config.evaluator == "qwen3-vl":
+        minutes = frames / (_REPLIES_PER_MINUTE * config.qwen.concurrency)
     return Estimate(minutes=minutes, memory_gb=0.3, disk_gb=0.001)
 
 
