@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -36,16 +37,9 @@ class Setting:
     @property
     def default_text(self) -> str:
         """The default as written after ``--set NAME=``; "unset" for None."""
-        match self.default:
-            case None:
-                return "unset"
-            case bool():
-                return str(self.default).lower()
-            case str():
-                return self.default or '""'
-            case list():
-                return f"[{', '.join(map(str, self.default))}]"
-        return str(self.default)
+        if self.default is None:
+            return "unset"
+        return self.default or '""' if isinstance(self.default, str) else json.dumps(self.default)
 
 
 def settings_of(section: str, model: type[BaseModel]) -> list[Setting]:
