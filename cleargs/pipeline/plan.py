@@ -229,20 +229,15 @@ class Planner:
 
     def _with_present_settings(self, manifest: Manifest, shown: Mapping[str, Manifest]) -> KeyParts:
         """Return the parts of ``manifest`` with the current settings and inputs of its stage."""
-        name, parts = manifest.stage, manifest.parts
+        name = manifest.stage
         digests = self.external_digests(name)
-        return parts.model_copy(
-            update={
-                "config": _updated(
-                    stage_key_config(self.dag.load(name), name, self.run.config.effective), parts.config
-                ),
-                "seed": self.run.config.seed,
-                "inputs": _updated(self.inputs(name, shown)[0], parts.inputs),
-                "externals": _updated(
-                    {role: tree_digest(digests[role]) for role in digests}, parts.externals
-                ),
-            }
-        )
+        now = {
+            "config": stage_key_config(self.dag.load(name), name, self.run.config.effective),
+            "seed": self.run.config.seed,
+            "inputs": self.inputs(name, shown)[0],
+            "externals": {role: tree_digest(files) for role, files in digests.items()},
+        }
+        return manifest.parts.model_copy(update=_updated(now, dict(manifest.parts)))
 
     def plan(self, until: str | None = None, force: tuple[str, ...] = ()) -> list[StagePlan]:
         """Return the state of each stage up to and including ``until``; stages in ``force`` count as missing.
