@@ -57,14 +57,21 @@ def write_video(
         InputError: an odd size, or this PyAV has no such encoder.
         StoreError: the disk is full or not writable.
     """
-    _require_encoder(codec)
+    encoder, options = _ENCODERS[codec][0], dict(_ENCODERS[codec][1])
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints all its settings on stderr
+    try:
+        av.codec.Codec(encoder, "w")
+    except av.codec.codec.UnknownCodecError:
+        raise InputError(
+            f"this PyAV is built without {encoder}",
+            hint="choose another --codec, or install the wheel of PyAV (pip install --force-reinstall av)",
+        ) from None
     frames = iter(frames)
     first = next(frames)
     height, width = first.shape[:2]
     require_even(width, height)
     rate = Fraction(fps).limit_denominator(1001)
     with atomic_path(path) as temporary, av.open(temporary, "w") as container:
-        encoder, options = _ENCODERS[codec][0], dict(_ENCODERS[codec][1])
         if bits_per_pixel is not None:
             del options["crf"]
             bits = str(round(bits_per_pixel * width * height * fps))
@@ -82,17 +89,6 @@ def write_video(
             frame.pts, frame.time_base = number, 1 / rate
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-
-
-def _require_encoder(codec: Codec) -> None:
-    os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints all its settings on stderr
-    try:
-        av.codec.Codec(_ENCODERS[codec][0], "w")
-    except av.codec.codec.UnknownCodecError:
-        raise InputError(
-            f"this PyAV is built without {_ENCODERS[codec][0]}",
-            hint="choose another --codec, or install the wheel of PyAV (pip install --force-reinstall av)",
-        ) from None
 
 
 def _planar(rgb: ImageU8) -> VideoFrame:
