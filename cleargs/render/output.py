@@ -78,18 +78,6 @@ def kind_of(output: Path) -> Kind:
     )
 
 
-def require_free(output: Path, *, force: bool) -> None:
-    """Raise InputError if ``output`` exists and ``force`` is not given.
-
-    A folder is never replaced, since it may contain other files than our stills.
-    """
-    if kind_of(output) == "folder":
-        if output.parent.exists():
-            raise InputError(f"{output.parent} exists already", hint="choose a new folder")
-    elif output.exists() and not force:
-        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
-
-
 def write_shots(
     output: Path, scene: Scene, shots: Sequence[Shot], task: Task, *, fps: float, codec: Codec, device: str
 ) -> None:

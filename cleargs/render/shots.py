@@ -18,7 +18,7 @@ from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
 from cleargs.progress import Reporter
-from cleargs.render.output import Kind, Shot, kind_of, require_free, write_shots
+from cleargs.render.output import Kind, Shot, kind_of, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.safe_io import FAULTS, cause, read_json
 from cleargs.splat.camera import Camera
@@ -95,8 +95,12 @@ def render_run(
         InputError: an option cannot be used, or ``output`` exists and is not to be replaced.
     """
     options.check(output)
-    require_free(output, force=force)
-    shots = _shots(scene.parents[1] / "ingest", options, kind_of(output))
+    kind = kind_of(output)
+    if kind == "folder" and output.parent.exists():  # it may contain other files than stills
+        raise InputError(f"{output.parent} exists already", hint="choose a new folder")
+    if kind != "folder" and output.exists() and not force:
+        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+    shots = _shots(scene.parents[1] / "ingest", options, kind)
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
         write_shots(output, read_ply(scene), shots, task, fps=options.fps, codec=options.codec, device=device)
     return shots
