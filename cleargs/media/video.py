@@ -133,12 +133,9 @@ def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8
 def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame, float]]:
     """Yield the wanted frames that can be decoded, with the width of their pixels over the height."""
     wanted = set(pts)
-    last = max(wanted)
     with _open(path) as (container, stream):
         stream.thread_type = "AUTO"
         for frame in _progressive(container, stream):
-            if frame.pts is None or frame.pts > last:
-                continue
             if frame.pts in wanted:
                 wanted.discard(frame.pts)
                 yield frame.pts, frame, float(stream.sample_aspect_ratio or 1.0)
@@ -214,9 +211,8 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         with av.open(path, metadata_errors="replace") as container:
             if not container.streams.video:
                 raise InputError(f"{path.name} holds no video", hint="give a video, or a folder of images")
-            stream = container.streams.video[0]
-            if len(container.streams.video) > 1:
-                stream = container.streams.video[_by_merit(path)[0]]
+            streams = container.streams.video
+            stream = streams[_by_merit(path)[0] if len(streams) > 1 else 0]
             if stream.codec_context is None:  # FFmpeg does not know its form
                 raise InputError(f"{path.name} is in a form that cannot be decoded", hint=_HINT)
             if min(stream.width, stream.height) < 1:
