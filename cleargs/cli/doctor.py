@@ -6,7 +6,6 @@ import os
 import platform
 import shutil
 import tempfile
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,6 +17,7 @@ from cleargs.cli.common import answer, json_option
 from cleargs.cli.user_config import user_config_file
 from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import usable_cores
+from cleargs.plugins import installed_version
 from cleargs.splat.kernels.memory import available_memory
 from cleargs.splat.pace import cached_pace
 
@@ -90,12 +90,10 @@ def _device(wants_test: bool) -> tuple[Finding, list[str]]:
 
 
 def _library(name: str) -> Finding:
-    if name == "onnxruntime" and (found := installed_runtimes()) != "absent":  # under any of its names
-        return Finding(name, "ok", found)
-    try:
-        return Finding(name, "ok", version(name))
-    except PackageNotFoundError:
+    found = installed_runtimes() if name == "onnxruntime" else installed_version(name)  # it has several names
+    if found == "absent":
         return Finding(name, "bad", "not installed: install cleargs again")
+    return Finding(name, "ok", found)
 
 
 def _room(what: str, free: float, least_gb: float, advice: str) -> Finding:
