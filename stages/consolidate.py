@@ -59,11 +59,7 @@ def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: ConsolidateConfig) -> None:
-    """Load the scorer.
-
-    Raises:
-        InputError: It is not installed, damaged or of another form.
-    """
+    """Load the scorer. Raises InputError if it is not installed, damaged or of another form."""
     from cleargs.models.scorer import load_scorer
 
     load_scorer(config.scorer)

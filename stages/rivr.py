@@ -141,11 +141,7 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: RivrConfig) -> None:
-    """Load the expert and the scorers.
-
-    Raises:
-        InputError: One is not installed, damaged or of another form.
-    """
+    """Load expert and scorers. Raises InputError if one is not installed, damaged or of another form."""
     from cleargs.models.expert import load_expert
     from cleargs.models.scorer import load_scorer
 
@@ -261,11 +257,8 @@ def _repair_and_distil(
     """Run every round along the trajectory, group by group.
 
     A round in which no candidate is taken is the last one. Its training also takes the steps of the rounds
-    that are left.
-
-    Returns:
-        The rows of all frames (``others``, those of the frames that no round repairs, first), the folders of
-        the trainings, and the last scene.
+    that are left. Returns the rows of all frames (``others``, those of the frames that no round repairs,
+    first), the folders of the trainings, and the last scene.
     """
     from cleargs.rivr.distillation import drop_state
     from cleargs.rivr.rounds import pseudo_view, run_round

@@ -33,11 +33,7 @@ def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: RvaConfig) -> None:
-    """Check the evaluator.
-
-    Raises:
-        InputError: if the server does not answer or does not have the model.
-    """
+    """Check the evaluator. Raises InputError if its server does not answer or does not have the model."""
     from cleargs.rva.evaluators import check_evaluator
 
     check_evaluator(config)

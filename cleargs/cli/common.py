@@ -282,8 +282,7 @@ def fail_below_option(figures: str) -> Callable[[F], F]:
 def report_below(results: Mapping[str, Mapping[str, Any]], limits: Mapping[str, float]) -> bool:
     """Print a line on stderr for each figure of ``results`` that is below its limit. Return True if one is.
 
-    Raises:
-        InputError: No result has a figure of this name.
+    Raises InputError if no result has a figure of this name.
     """
     failed = False
     for figure, limit in limits.items():
@@ -301,8 +300,7 @@ def report_below(results: Mapping[str, Mapping[str, Any]], limits: Mapping[str, 
 def with_shortcuts(overrides: Sequence[str], values: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the settings of the options in ``values`` (`SHORTCUTS`; None: not given), then ``overrides``.
 
-    Raises:
-        InputError: ``overrides`` has one of these settings too.
+    Raises InputError if ``overrides`` has one of these settings too.
     """
     named = {text.partition("=")[0].strip() for text in overrides}
     given = {SHORTCUTS[option]: (option, value) for option, value in values.items() if value is not None}

@@ -88,8 +88,7 @@ def report(
 def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
     """Write the report at the end of a run, unless there already is one of the same results.
 
-    Returns:
-        The page, or None if no frames exist or writing failed (with a warning).
+    Return the page, or None if no frames exist or writing failed (with a warning).
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)

@@ -19,8 +19,7 @@ def user_config_file() -> Path:
 def user_defaults(commands: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return command -> option -> default from the user's file, for click, which checks the values.
 
-    Raises:
-        ConfigError: The file cannot be read, or has another entry than `DEFAULTS`.
+    Raises ConfigError if the file cannot be read, or has another entry than `DEFAULTS`.
     """
     path = user_config_file()
     if not path.is_file():

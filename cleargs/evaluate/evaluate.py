@@ -116,10 +116,8 @@ def evaluate_images(
 ) -> Evaluation:
     """Measure the images in ``folder``, of any method, matched with the references by their stems.
 
-    The other arguments are those of `evaluate_scene`.
-
-    Raises:
-        InputError: no stem matches, an image cannot be read, or has another size than its reference.
+    The other arguments are those of `evaluate_scene`. Raises InputError if no stem matches, or if an image
+    cannot be read or has another size than its reference.
     """
     if options.refine_poses:
         raise InputError("finished images have no pose to refine", hint="leave out --refine-poses")

@@ -211,10 +211,8 @@ def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Simil
 
     The centres of a handheld walk are near a line or a plane and fix only poorly the turn: half a degree may
     be left, which costs an image decibels. They only fix the size. Then each camera counts as four points:
-    its centre, and one on each axis at the distance by which the centres spread.
-
-    Raises:
-        InputError: fewer than three cameras, or centres on one line.
+    its centre, and one on each axis at the distance by which the centres spread. Raises InputError for fewer
+    than three cameras, or for centres on one line.
     """
     theirs, ours = (np.stack([pose.centre for pose in poses]) for poses in (source, target))
     scale = umeyama(theirs, ours).scale
@@ -242,10 +240,8 @@ def _with_axes(
 def umeyama(source: NDArray[np.float64], target: NDArray[np.float64]) -> Similarity:
     """Return the least-squares similarity from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
 
-    Both are the centres [N, 3] of the same cameras.
-
-    Raises:
-        InputError: fewer than three centres, or centres on one line.
+    Both are the centres [N, 3] of the same cameras. Raises InputError for fewer than three centres, or for
+    centres on one line.
     """
     hint = "give at least three references, taken at places that are not on one line"
     if len(source) < 3:

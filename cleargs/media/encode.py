@@ -51,11 +51,8 @@ def write_video(
     """Write ``frames`` (at least one, read one by one) as an MP4: 4:2:0, BT.709, limited range.
 
     ``bits_per_pixel`` is kept over each second by one thread, so that equal frames give equal bytes. None: no
-    visible loss.
-
-    Raises:
-        InputError: an odd size, or this PyAV has no such encoder.
-        StoreError: the disk is full or not writable.
+    visible loss. Raises InputError for an odd size or if this PyAV has no such encoder, and StoreError if the
+    disk is full or not writable.
     """
     encoder, options = _ENCODERS[codec][0], dict(_ENCODERS[codec][1])
     os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints all its settings on stderr

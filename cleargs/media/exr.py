@@ -132,8 +132,7 @@ def _write(
 def read_exr(path: Path, prefix: str = "") -> LayeredImage:
     """Read every named RGB layer of ``path``, and the attributes whose name begins with ``prefix``.
 
-    Raises:
-        StoreError: the file is missing, damaged, or has a channel outside an RGB layer.
+    Raises StoreError if the file is missing, damaged, or has a channel outside an RGB layer.
     """
     try:
         spec, pixels = _read(path, HALF)

@@ -58,11 +58,7 @@ def is_panorama(path: Path) -> bool:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height of the image in ``path`` as it is stored.
-
-    Raises:
-        InputError: there is no readable image.
-    """
+    """Return width and height of the image in ``path`` as it is stored. Raises InputError without one."""
     with _opened(path) as image:
         width, height = image.size
         swapped = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) >= 5
@@ -73,10 +69,8 @@ def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
     """Return the image in ``path`` as 8-bit sRGB [H, W, 3].
 
     Alpha is dropped, 16 bits are reduced to 8, and an ICC profile is converted to sRGB. With ``upright``, the
-    image is turned by its EXIF orientation.
-
-    Raises:
-        InputError: there is no readable image, or it has more than `MAX_PIXELS`.
+    image is turned by its EXIF orientation. Raises InputError if there is no readable image, or if it has
+    more than `MAX_PIXELS`.
     """
     with _decoded(path, upright=upright) as image:
         rgb = (_grey(image) if image.mode.startswith("I;16") else image).convert("RGB")

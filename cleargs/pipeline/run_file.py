@@ -141,9 +141,7 @@ def read_run_file(
 ) -> RunSpec:
     """Read the run in ``folder``. ``store`` and ``device`` replace those in ``run.toml``.
 
-    Raises:
-        InputError: The folder has no ``run.toml``.
-        ConfigError: The file is damaged.
+    Raises InputError if the folder has no ``run.toml``, and ConfigError if the file is damaged.
     """
     folder = folder.absolute()
     if not (folder / RUN_FILE).is_file():

@@ -52,8 +52,7 @@ def export_scene(
 ) -> list[str]:
     """Write the scene of ``stage`` to each of the ``outputs``. Return messages about the result.
 
-    Raises:
-        InputError: an option cannot be used, or a file exists and is not to be replaced.
+    Raises InputError if an option cannot be used, or if a file exists and is not to be replaced.
     """
     kinds = [format_of(output) for output in outputs]
     for kind in kinds:

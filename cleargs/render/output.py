@@ -84,11 +84,8 @@ def write_shots(
     """Render shots of one size and write them to ``output`` (see `kind_of`), atomically.
 
     A folder of stills also gets ``cameras.json``. ``task`` receives one step per shot. ``fps`` and ``codec``
-    are those of a film.
-
-    Raises:
-        InputError: There are several shots for one still, or the size does not fit the codec.
-        StoreError: The disk is full or not writable.
+    are those of a film. Raises InputError if there are several shots for one still, or if the size does not
+    fit the codec, and StoreError if the disk is full or not writable.
     """
     kind, camera = kind_of(output), shots[0].camera
     if kind == "still" and len(shots) > 1:

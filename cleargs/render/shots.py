@@ -91,8 +91,7 @@ def render_run(
 ) -> list[Shot]:
     """Render the scene file of a stage, in its run folder, to ``output``. Return the shots.
 
-    Raises:
-        InputError: an option cannot be used, or ``output`` exists and is not to be replaced.
+    Raises InputError if an option cannot be used, or if ``output`` exists and is not to be replaced.
     """
     options.check(output)
     kind = kind_of(output)

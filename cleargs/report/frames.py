@@ -151,8 +151,7 @@ def faults_of(judged: Mapping[str, Any]) -> dict[str, float]:
 def scene_with_models(rows: Sequence[FrameRow], run: Path, stages: Collection[str]) -> TrainedScene | None:
     """Return the last scene of ``run`` where it has a model of any of ``rows``, else None.
 
-    Raises:
-        StoreError: A file of the scene is damaged.
+    Raises StoreError if a file of the scene is damaged.
     """
     last = last_scene(stages)
     return TrainedScene(run / last) if last and any(row.modelled for row in rows) else None

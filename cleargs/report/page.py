@@ -82,9 +82,8 @@ def page_environment() -> Environment:
 def write_report(planner: Planner) -> Path:
     """Write the report of a run atomically, in place of an older one. Return the path of its page.
 
-    Raises:
-        InputError: if no stage of the run is finished.
-        StoreError: if a result is damaged, or the report cannot be written.
+    Raises InputError if no stage of the run is finished, and StoreError if a result is damaged or the report
+    cannot be written.
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
@@ -158,11 +157,7 @@ def write_report(planner: Planner) -> Path:
 def _write_scene(
     folder: Path, run: Path, stage: str, placed: Sequence[FrameRow]
 ) -> tuple[dict[str, Any], Viewer]:
-    """Write the last scene, with a still.
-
-    Returns:
-        The data of the scene for the template, and its renderer.
-    """
+    """Write the last scene, with a still. Return its data for the template, and its renderer."""
     camera = camera_of(opening_frame(placed).frame)
     still = camera.scaled(_STILL / max(camera.width, camera.height))
     scene = read_ply(run / stage / "scene.ply")
