@@ -105,8 +105,9 @@ class Batch:
         settings = [word for text in (*self.overrides, *scene.overrides) for word in ("--set", text)]
         until = ["--until", self.until] if self.until else []
         device = "auto" if self.falls_back else self.device
+        run, store = str(self.run_folder(scene)), str(self.folder / "store")
         return [
-            *("run", str(scene.source), "-o", str(self.run_folder(scene)), "--store", str(self._store)),
+            *("run", str(scene.source), "-o", run, "--store", store),
             *("--recipe", scene.recipe, *settings, *until, "--device", device, *self.options),
         ]
 
@@ -242,17 +243,13 @@ class Batch:
             self.run_folder(scene),
             recipe=scene.recipe,
             overrides=(*self.overrides, *scene.overrides),
-            store=self._store,
+            store=self.folder / "store",
             device="cpu",
             reporter=SilentReporter(),
         )
         before = read_metadata(run.folder) if self.falls_back else RunMetadata()
         # The device is not checked: a login node may not have it.
         return replace(run, device=before.device or self.device, on_cpu=before.on_cpu)
-
-    @property
-    def _store(self) -> Path:
-        return self.folder / "store"
 
 
 def program() -> list[str]:

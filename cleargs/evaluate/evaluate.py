@@ -78,19 +78,10 @@ def evaluate_scene(
     subject: str | None = None,
     save: Path | None = None,
 ) -> Evaluation:
-    """Render ``scene`` at every view of ``reference``, without exposure affines, and measure.
+    """Render the PLY file ``scene`` at every view of ``reference``, without exposure affines, and measure.
 
-    Args:
-        scene: PLY file.
-        reference: images to compare with.
-        options: metrics and adjustments.
-        threads: CPU threads; results do not depend on it.
-        reporter: shows progress.
-        subject: name in the result; None: the file's name.
-        save: folder for the evaluated images.
-
-    Raises:
-        InputError: the file is not a scene.
+    ``subject`` is its name in the result (None: that of the file). ``save`` is a folder for the evaluated
+    images. Results do not depend on ``threads``. Raises InputError if the file is not a scene.
     """
     try:
         loaded = read_ply(scene)
