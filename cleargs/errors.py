@@ -5,7 +5,7 @@ The command line turns each error into its exit code. It prints a traceback only
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 
@@ -13,6 +13,11 @@ def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return a hint for an unknown name: the most similar name in ``known``, or ``otherwise`` without one."""
     near = get_close_matches(name, list(known), n=1)
     return f"did you mean {near[0]}?" if near else otherwise
+
+
+def listed(items: Sequence[str]) -> str:
+    """Return the first three items of a long list, and the number of the others."""
+    return ", ".join(items[:3]) + (f" and {len(items) - 3} more" if len(items) > 3 else "")
 
 
 class CleargsError(Exception):

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from cleargs.capture.capture import External, SourceFrame
-from cleargs.errors import InputError
+from cleargs.errors import InputError, listed
 from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 
 T = TypeVar("T")
@@ -88,8 +88,7 @@ def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str,
     """
     if not missing:
         return ()
-    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-    lost = f"images that do not exist: {', '.join(missing[:3])}{more}"
+    lost = f"images that do not exist: {listed(missing)}"
     if 2 * len(missing) > total:
         raise InputError(
             f"{listing} lists {len(missing)} {lost}",
@@ -117,8 +116,8 @@ def left_out(folder: Path) -> tuple[str, ...]:
 
 
 def _counted(files: Sequence[Path], word: str) -> str:
-    listed = ", ".join(path.name for path in files[:3]) + (", ..." if len(files) > 3 else "")
-    return f"{len(files)} {word}{'' if len(files) == 1 else 's'} ({listed})"
+    names = ", ".join(path.name for path in files[:3]) + (", ..." if len(files) > 3 else "")
+    return f"{len(files)} {word}{'' if len(files) == 1 else 's'} ({names})"
 
 
 def is_inside(name: str) -> bool:

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 from pydantic import BaseModel
 
+from cleargs.errors import listed
 from cleargs.manifest import KeyParts
 from cleargs.pipeline.settings import fields_of, flattened
 from cleargs.pipeline.stage import Device, Stage
@@ -118,12 +119,10 @@ def _show(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _changed_files(old: Mapping[str, str], new: Mapping[str, str], limit: int = 3) -> str:
+def _changed_files(old: Mapping[str, str], new: Mapping[str, str]) -> str:
     """Return the first few changed files as ": a.png changed, b.png added"; " changed" for a single file."""
     names = [name for name, _, _ in _changes(old, new) if name]
     if not names:
         return " changed"
     words = {(True, True): "changed", (True, False): "removed", (False, True): "added"}
-    shown = [f"{name} {words[name in old, name in new]}" for name in names[:limit]]
-    more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return ": " + ", ".join(shown) + more
+    return ": " + listed([f"{name} {words[name in old, name in new]}" for name in names])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from cleargs.digest import DigestMemo
-from cleargs.errors import ConfigError, InputError
+from cleargs.errors import ConfigError, InputError, listed
 from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
 from cleargs.pipeline.config import check_document, known_settings, load_config
 from cleargs.pipeline.dag import Dag
@@ -26,8 +26,6 @@ from cleargs.pipeline.store import STORE_FOLDER, Store
 from cleargs.progress import Reporter
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
-
-MAX_LISTED = 3  # settings of an existing run that a message lists
 
 
 def usable_cores() -> int:
@@ -135,7 +133,7 @@ def resolve_run(
         settings, others = known_settings(dag, {} if forgets else metadata.settings)
         kept = check_document(dag, settings) if settings else None
         if others:
-            reporter.warn(f"{folder / RUN_FILE} has settings that do not exist, left out: {_listed(others)}")
+            reporter.warn(f"{folder / RUN_FILE} has settings that do not exist, left out: {listed(others)}")
     except ConfigError as error:
         if not forgets:
             raise ConfigError(
@@ -150,12 +148,7 @@ def resolve_run(
         own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
         if own:
             reporter.info(
-                f"settings kept from {folder / RUN_FILE}: {_listed(own)}; --reset starts from the recipe"
+                f"settings kept from {folder / RUN_FILE}: {listed(own)}; --reset starts from the recipe"
             )
     on_cpu = metadata.on_cpu if keeps else ()
     return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")
-
-
-def _listed(items: Sequence[str]) -> str:
-    more = f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else ""
-    return ", ".join(items[:MAX_LISTED]) + more
