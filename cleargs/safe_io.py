@@ -11,11 +11,13 @@ import os
 import stat
 import struct
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
-from cleargs.errors import InputError
+from cleargs.errors import CleargsError, InputError
 
 MAX_BYTES = 4 * 2**30
 """Maximum size of a file that is read as a whole (an image, a sparse model, a scene, a network)."""
@@ -102,6 +104,17 @@ def cause(error: Exception) -> str:
         if isinstance(error, kind):
             return message
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@contextmanager
+def faults_as(
+    kind: type[CleargsError], what: str, *, hint: str, faults: tuple[type[Exception], ...] = FAULTS
+) -> Iterator[None]:
+    """Turn one of the ``faults`` in the block into an error of the ``kind``: ``what``, then its cause."""
+    try:
+        yield
+    except faults as error:
+        raise kind(f"{what}: {cause(error)}", hint=hint) from error
 
 
 def printable(text: str, keep: str = "") -> str:

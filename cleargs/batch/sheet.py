@@ -15,7 +15,7 @@ from cleargs.base_model import FrozenModel
 from cleargs.errors import InputError
 from cleargs.pipeline.config import merge, parse_toml
 from cleargs.pipeline.settings import flattened
-from cleargs.safe_io import FAULTS, cause, read_text
+from cleargs.safe_io import faults_as, read_text
 
 NAMES = "letters, digits, and _ . - after the first, at most 100"
 """Description of a valid name for a message."""
@@ -78,10 +78,8 @@ def read_scenes(path: Path) -> list[SceneJob]:
     Settings and inputs are not checked yet. Raises SheetError with all mistakes, and InputError if the file
     cannot be read.
     """
-    try:
+    with faults_as(InputError, f"cannot read {path}", hint="give a sheet, TOML or CSV"):
         text = read_text(path)
-    except FAULTS as error:
-        raise InputError(f"cannot read {path}: {cause(error)}", hint="give a sheet, TOML or CSV") from error
     scenes: dict[str, SceneJob] = {}
     folder, problems = path.absolute().parent, []
     rows = _csv_rows(path, text) if path.suffix.lower() == ".csv" else _toml_rows(path, text)

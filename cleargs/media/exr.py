@@ -20,7 +20,7 @@ from cleargs.errors import StoreError
 from cleargs.files import atomic_path
 from cleargs.media import MAX_PIXELS
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.safe_io import FAULTS, cause, open_regular
+from cleargs.safe_io import cause, faults_as, open_regular
 from cleargs.types import ImageF32, PlaneF32
 
 Layer: TypeAlias = NDArray[np.float16]  # [H, W, 3] scene-linear Rec.709
@@ -77,12 +77,10 @@ def write_depth(path: Path, depth: NDArray[Any]) -> None:  # [H, W]
 
 def read_depth(path: Path) -> PlaneF32:
     """Read the file of `write_depth`. Raises StoreError if it is missing, damaged, or has other channels."""
-    try:
+    with faults_as(StoreError, f"cannot read {path.name}", hint="delete the file"):
         spec, pixels = _read(path, FLOAT)
         if spec.channelnames != ("Z",):
             raise ValueError(f"its channels are {spec.channelnames}, not Z alone")
-    except FAULTS as error:
-        raise StoreError(f"cannot read {path.name}: {cause(error)}", hint="delete the file") from error
     return np.ascontiguousarray(pixels[..., 0])
 
 
@@ -134,7 +132,8 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
 
     Raises StoreError if the file is missing, damaged, or has a channel outside an RGB layer.
     """
-    try:
+    # OpenImageIO's messages may contain bytes of the file that are not text.
+    with faults_as(StoreError, f"cannot read {path.name}", hint="delete the file and run its stage again"):
         spec, pixels = _read(path, HALF)
         place = {name: k for k, name in enumerate(spec.channelnames)}
         # The plain channels are one of the layers again.
@@ -146,8 +145,4 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
         kept: dict[str, Any] = {
             item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)
         }
-    except FAULTS as error:  # OpenImageIO's messages may contain bytes of the file that are not text
-        raise StoreError(
-            f"cannot read {path.name}: {cause(error)}", hint="delete the file and run its stage again"
-        ) from error
     return LayeredImage(layers, kept)

@@ -15,7 +15,7 @@ from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import MAX_PIXELS
-from cleargs.safe_io import FAULTS, cause, open_regular
+from cleargs.safe_io import FAULTS, cause, faults_as, open_regular
 from cleargs.types import AnyImage, ImageF32, ImageU8, MaskU8
 
 _FORMATS = ["JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF"]  # formats that are read, as Pillow names them
@@ -148,12 +148,8 @@ def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open the image in ``path`` without decoding it. Errors of the block become an InputError."""
-    try:
-        with open_regular(path) as file:
-            head = file.read(12)
-            file.seek(0)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
+    with faults_as(InputError, f"cannot read {path}", hint=_HINT), open_regular(path) as file:
+        head = file.read(12)
     if not head:
         raise InputError(f"{path} is empty (zero bytes)", hint=_HINT)
     heic = head[4:8] == b"ftyp" and head[8:12] in _HEIC

@@ -19,7 +19,7 @@ from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import Setting, flattened, settings_of, suggestion
 from cleargs.pipeline.stage import Stage
-from cleargs.safe_io import FAULTS, cause, read_text
+from cleargs.safe_io import FAULTS, faults_as, read_text
 
 RECIPES = "cleargs.workflows"
 """The package with the recipes that have a name."""
@@ -91,23 +91,15 @@ def recipe_names() -> list[str]:
 
 def read_toml(path: Path) -> Document:
     """Read a TOML file. Raises ConfigError if it cannot be read."""
-    try:
+    with faults_as(ConfigError, f"cannot read {path}", hint="check the path of the TOML file"):
         text = read_text(path)
-    except FAULTS as error:
-        raise ConfigError(
-            f"cannot read {path}: {cause(error)}", hint="check the path of the TOML file"
-        ) from error
     return parse_toml(text, path.name)
 
 
 def parse_toml(text: str, name: str) -> Document:
     """Parse TOML. ``name`` is the file name for the message of a ConfigError."""
-    try:
-        return tomllib.loads(text)
-    except FAULTS as error:  # TOMLDecodeError is a ValueError
-        raise ConfigError(
-            f"{name} is not valid TOML: {cause(error)}", hint="see https://toml.io for the syntax"
-        ) from error
+    with faults_as(ConfigError, f"{name} is not valid TOML", hint="see https://toml.io for the syntax"):
+        return tomllib.loads(text)  # TOMLDecodeError is a ValueError
 
 
 def parse_override(text: str) -> Document:

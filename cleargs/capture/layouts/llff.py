@@ -12,7 +12,7 @@ from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import chosen, image_files, image_folders, mask_externals
 from cleargs.errors import InputError
-from cleargs.safe_io import FAULTS, cause, open_regular
+from cleargs.safe_io import FAULTS, faults_as, open_regular
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,7 +73,8 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
     """
     import numpy as np
 
-    try:
+    hint = "write it again with LLFF's imgs2poses.py, or set ingest.poses=sfm"
+    with faults_as(InputError, f"cannot read {path}", hint=hint, faults=_FAULTS):
         open_regular(path).close()
         # Mapped, so that a damaged header cannot ask for more memory than the file has bytes.
         with warnings.catch_warnings(action="ignore"):  # Python 2 wrote some
@@ -81,11 +82,6 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
             raise ValueError(f"it holds {table.dtype} of shape {table.shape}, not numbers of shape (N, 17)")
         return np.array(table, np.float64)
-    except _FAULTS as error:
-        raise InputError(
-            f"cannot read {path}: {cause(error)}",
-            hint="write it again with LLFF's imgs2poses.py, or set ingest.poses=sfm",
-        ) from error
 
 
 def _frame(row: NDArray[np.float64], path: Path) -> SourceFrame:

@@ -21,7 +21,7 @@ from cleargs.capture.folders import (
     require_most,
 )
 from cleargs.errors import InputError
-from cleargs.safe_io import FAULTS, cause, read_json
+from cleargs.safe_io import FAULTS, faults_as, read_json
 
 if TYPE_CHECKING:
     from cleargs.capture.cameras import Intrinsics, Pose
@@ -124,7 +124,8 @@ def _camera(values: Mapping[str, Any], image: Path) -> Intrinsics:
     """Return the camera of a frame from its own values, else from those of the whole file."""
     from cleargs.capture.cameras import Intrinsics
 
-    try:
+    hint = "give w, h, fl_x, fl_y, cx, cy (or camera_angle_x), or set ingest.poses=sfm"
+    with faults_as(InputError, f"the camera of {image.name} cannot be read", hint=hint):
         if "w" in values and "h" in values:
             width, height = int(values["w"]), int(values["h"])
         else:
@@ -138,11 +139,6 @@ def _camera(values: Mapping[str, Any], image: Path) -> Intrinsics:
             raise ValueError("neither fl_x nor camera_angle_x is given")
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         k1, k2, k3, k4, p1, p2 = (float(values.get(key) or 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    except FAULTS as error:
-        raise InputError(
-            f"the camera of {image.name} cannot be read: {cause(error)}",
-            hint="give w, h, fl_x, fl_y, cx, cy (or camera_angle_x), or set ingest.poses=sfm",
-        ) from error
     model = str(values.get("camera_model", "OPENCV")).upper()
     if model in _FISHEYE or values.get("is_fisheye"):
         return Intrinsics("OPENCV_FISHEYE", width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
@@ -188,7 +184,8 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
 
     Raises InputError if the file is damaged, or an entry names no image.
     """
-    try:
+    hint = "it must be a JSON object with a 'frames' list, as nerfstudio or instant-ngp write it"
+    with faults_as(InputError, f"cannot read {path}", hint=hint):
         data = read_json(path)
         if not isinstance(data, dict) or "frames" not in data:
             raise ValueError("it has no 'frames'")
@@ -205,11 +202,6 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
             mask = find(values["mask_path"]) if "mask_path" in values else None
             entries.append(_Entry(values, find(values["file_path"]), mask))
         return data, entries
-    except FAULTS as error:
-        raise InputError(
-            f"cannot read {path}: {cause(error)}",
-            hint="it must be a JSON object with a 'frames' list, as nerfstudio or instant-ngp write it",
-        ) from error
 
 
 def _finder(root: Path) -> Callable[[str], Path | None]:
