@@ -26,6 +26,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
+from cleargs.safe_io import faults_as
 
 _PAGES: Mapping[str, str] = {"/": "live.html", "/live.css": "live.css", "/live.js": "live.js"}
 _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'"
@@ -41,13 +42,9 @@ class Server(ThreadingHTTPServer):
 
     def __init__(self, dag: Dag, run: RunSpec, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        try:
+        hint = "choose another --port (0: any free port), or a --host of this machine"
+        with faults_as(InputError, f"cannot serve at {host}:{port}", hint=hint, faults=(OSError,)):
             super().__init__((host, port), partial(_Handler, dag, run, host))
-        except OSError as error:
-            raise InputError(
-                f"cannot serve at {host}:{port}: {error.strerror or error}",
-                hint="choose another --port (0: any free port), or a --host of this machine",
-            ) from error
 
     @property
     def address(self) -> str:
