@@ -32,13 +32,10 @@ Example:
 def diff(dag: Dag, first: Path, second: Path, as_json: bool) -> None:
     """List the settings in which two runs differ, and their figures side by side."""
     runs = [read_run_file(run, dag) for run in (first, second)]
-    settings, figures = (
-        [dict(facts(run)) for run in runs] for facts in (_settings, lambda run: _figures(run, dag))
-    )
-    found = {
-        "settings": {name: pair for name, pair in _paired(*settings) if pair[0] != pair[1]},
-        "figures": dict(_paired(*figures)),
-    }
+    settings = _paired(*(dict(_settings(run)) for run in runs))
+    figures = _paired(*(dict(_figures(run, dag)) for run in runs))
+    changed = {name: pair for name, pair in settings if pair[0] != pair[1]}
+    found = {"settings": changed, "figures": dict(figures)}
     if as_json:
         print_json({"runs": [str(first), str(second)], **found})
         return
