@@ -28,6 +28,7 @@ from cleargs.evaluate.metrics import (
     fit_affine,
     load_metrics,
     pooled,
+    psnr,
     region,
 )
 from cleargs.evaluate.references import Reference, ReferenceView, matching
@@ -223,13 +224,12 @@ def _evaluate(
 
     def measured(name: str, prediction: _Prediction, target: ImageU8, mask: MaskBool | None) -> ImageResult:
         image, affine, aligned_psnr = prediction.image, None, None
-        everywhere = np.ones(target.shape[:2], bool)
         fitted = fit_affine(image, target / 255.0, mask)
         aligned = apply_affine(image, fitted)
         if options.align_colour:
             image, affine = aligned, fitted
         else:
-            aligned_psnr = region(to_uint8(aligned), target, everywhere, mask).psnr
+            aligned_psnr = psnr(to_uint8(aligned), target, mask)
         pixels, white = to_uint8(image), prediction.over_white
         if save is not None:
             write_rgb(save / f"{name}.png", pixels)
@@ -242,7 +242,7 @@ def _evaluate(
             reference=_digest(target, mask),
             colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
             psnr_colour_aligned=aligned_psnr,
-            psnr_white=None if white is None else region(to_uint8(white), target, everywhere, mask).psnr,
+            psnr_white=None if white is None else psnr(to_uint8(white), target, mask),
             psnr_between=None
             if white is None
             else decibels(float(np.square(white - prediction.image).sum()), white.size),
