@@ -82,9 +82,7 @@ def differences(
     if old.version != new.version:
         lines.append(f"stage version: {old.version} -> {new.version}")
     for name, before, after in _changes(dict(flattened(old.config)), dict(flattened(new.config))):
-        own = (
-            name.removeprefix(UPSTREAM_PREFIX) if name.startswith(UPSTREAM_PREFIX) else f"{new.stage}.{name}"
-        )
+        own = f"{new.stage}.{name}".removeprefix(f"{new.stage}.{UPSTREAM_PREFIX}")
         lines.append(f"setting {own}: {_show(before)} -> {_show(after)}")
     inputs = [("input", name) for name, _, _ in _changes(_input_digests(old), _input_digests(new))]
     externals = [("external", name) for name, _, _ in _changes(old.externals, new.externals)]

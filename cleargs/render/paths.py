@@ -114,8 +114,7 @@ def seen_point(cameras: Sequence[Camera]) -> ArrayF64:  # [3]
             hint="leave out --turntable to follow their path",
         )
     centres = np.stack([camera.centre for camera in cameras])
-    point: ArrayF64 = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(cameras))
-    return point
+    return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(cameras)))
 
 
 def up_axis(cameras: Sequence[Camera]) -> ArrayF64:  # [3] unit
@@ -163,5 +162,4 @@ def _at(samples: ArrayF64, motion: ArrayF64, path: ArrayF64) -> ArrayF64:
 
 
 def _unit(vector: ArrayF64) -> ArrayF64:
-    unit: ArrayF64 = vector / max(float(np.linalg.norm(vector)), 1e-12)
-    return unit
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
