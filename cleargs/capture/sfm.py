@@ -28,7 +28,7 @@ from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.media.image import lens_name
 from cleargs.progress import Reporter
-from cleargs.safe_io import FAULTS, cause, read_json
+from cleargs.safe_io import faults_as, read_json
 
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""
@@ -264,10 +264,8 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]
 
 def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
     """Return the model and the outcome of COLMAP's process. Raises InputError if one is damaged."""
-    try:
+    with faults_as(InputError, f"{OUTCOME} cannot be read", hint="run ingest again"):
         return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
-    except FAULTS as error:
-        raise InputError(f"{OUTCOME} cannot be read: {cause(error)}", hint="run ingest again") from error
 
 
 def _within_reach(model: SparseModel) -> SparseModel:

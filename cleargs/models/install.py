@@ -13,7 +13,7 @@ from pathlib import Path
 from cleargs.errors import InputError, StageError
 from cleargs.models.lpips import convert_sdist
 from cleargs.models.registry import RegistryEntry, Source, verify
-from cleargs.safe_io import cause, read_bytes
+from cleargs.safe_io import faults_as, read_bytes
 from cleargs.subprocesses import module_command
 
 
@@ -55,10 +55,8 @@ def place(model: RegistryEntry, directory: Path, write: Callable[[Path], object]
 
 def read_checked(path: Path, source: Source) -> bytes:
     """Return the content of a file, or raise InputError if it is not the published one."""
-    try:
+    with faults_as(InputError, f"{path} cannot be read", hint=f"give {source.label}"):
         data = read_bytes(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}", hint=f"give {source.label}") from error
     if source.sha256 and not hashlib.sha256(data).hexdigest().startswith(source.sha256):
         size = f"; it has {source.size} bytes" if source.size else ""
         raise InputError(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StageError
 from cleargs.plugins import installed_version
-from cleargs.safe_io import cause, read_bytes
+from cleargs.safe_io import faults_as, read_bytes
 
 Device = Literal["cpu", "cuda"]
 
@@ -97,12 +97,8 @@ class OnnxModel:
     def __init__(self, path: Path, device: Device = "cpu") -> None:
         import onnxruntime
 
-        try:
+        with faults_as(InputError, f"the model {path} cannot be read", hint="give the path of an .onnx file"):
             model = read_bytes(path)
-        except OSError as error:
-            raise InputError(
-                f"the model {path} cannot be read: {cause(error)}", hint="give the path of an .onnx file"
-            ) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
