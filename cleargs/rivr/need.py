@@ -7,8 +7,7 @@ need, the next in the order fill up.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from typing import Literal, TypeAlias
 
 from cleargs.formation.capture import median_misfit
@@ -27,66 +26,30 @@ MIN_SHARE, MIN_TRIED = 1 / 16, 2
 """Share of the frames, and number of frames, that are tried at least."""
 
 
-@dataclass(frozen=True)
-class Need:
-    """One frame and the grounds on which it may need a repair."""
-
-    assessment: FrameAssessment
-    formation: FrameFormation | None
-    """None where the training did not see the frame."""
-    relative_misfit: float
-    """The frame's misfit over the median of all frames; 0 where it has none."""
-
-    @property
-    def reason(self) -> str | None:
-        """Why the frame is in need; None where it is not."""
-        if self.assessment.role == Role.SUPPRESSED:
-            return "suppressed by RVA"
-        if self.relative_misfit > UNEXPLAINED:
-            return f"misfit of {self.relative_misfit:.1f} times the median"
-        modelled = self.formation is not None and self.formation.model != "none"
-        if self.assessment.role == Role.REACTIVATED and not modelled:
-            return "reactivated by RVA, and no model explains it"
-        return None
-
-
-def ranked_by_need(
-    assessments: Sequence[FrameAssessment], formations: Mapping[int, FrameFormation]
-) -> list[Need]:
-    """Return what each frame needs, neediest first."""
-    median = median_misfit(formations.values(), {frame.frame_id: frame.weight for frame in assessments})
-    needs = []
-    for frame in assessments:
-        formation = formations.get(frame.frame_id)
-        misfit = 0.0 if formation is None else formation.misfit
-        needs.append(Need(frame, formation, misfit / median if median > 0.0 else 0.0))
-
-    def order(need: Need) -> tuple[bool, float, float, int]:
-        frame = need.assessment
-        return need.reason is None, -need.relative_misfit, frame.R - frame.B, frame.frame_id
-
-    return sorted(needs, key=order)
-
-
-def frames_to_try(ranked: Sequence[Need]) -> list[int]:
-    """Return the frames in need, filled up to a sixteenth of ``ranked``, by frame_id."""
-    least = max(MIN_TRIED, math.ceil(MIN_SHARE * len(ranked)))
-    return sorted(
-        need.assessment.frame_id for k, need in enumerate(ranked) if k < least or need.reason is not None
-    )
-
-
 def frames_to_repair(
     which: Targets, supervision: Supervision, formations: Mapping[int, FrameFormation]
 ) -> list[int]:
     """Return the frames that every round repairs, by frame_id; never a held-out one.
 
-    ``which`` is ``all``, or ``auto``: those in need by the formations of the training before.
+    ``which`` is ``all``, or ``auto``: those in need by the formations of the training before, filled up to a
+    sixteenth of the frames.
     """
     frames = supervision.candidates
-    if which == "auto":
-        return frames_to_try(ranked_by_need(frames, formations))
-    return [frame.frame_id for frame in frames]
+    if which == "all":
+        return [frame.frame_id for frame in frames]
+    median = median_misfit(formations.values(), {frame.frame_id: frame.weight for frame in frames})
+
+    def order(frame: FrameAssessment) -> tuple[bool, float, float, int]:
+        """Return a sort key, neediest frame first. It begins with True where the frame is not in need."""
+        formation = formations.get(frame.frame_id, FrameFormation(frame.frame_id))
+        misfit = formation.misfit / median if median > 0.0 else 0.0
+        unmodelled = frame.role == Role.REACTIVATED and formation.model == "none"
+        in_need = frame.role == Role.SUPPRESSED or misfit > UNEXPLAINED or unmodelled
+        return not in_need, -misfit, frame.R - frame.B, frame.frame_id
+
+    least = max(MIN_TRIED, math.ceil(MIN_SHARE * len(frames)))
+    ranked = enumerate(sorted(map(order, frames)))
+    return sorted(frame_id for k, (spared, *_, frame_id) in ranked if k < least or not spared)
 
 
 def rows_of_others(
