@@ -24,6 +24,7 @@ from cleargs.progress import Reporter
 from cleargs.rva import measures
 from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, load_view
 from cleargs.rva.measures import DIRECTIONS, Luminance, blur_sigmas, detail_ratios, reduce_luminance
+from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.types import ArrayF64
 
 # Sigmas are standard deviations of the blur in px of the reduced image. Luma is in [0, 1] unless levels are
@@ -136,24 +137,25 @@ def cues_from_measures(rows: ArrayF64) -> ArrayF64:  # [n, 11] in [0, 1]
     content = content_detail(m)
     sigmas = blur_sigmas(m.detail, content)
     texture = texture_reliability(m, content)
-    artifacts = artifact_freedom(m)
     exposed = exposure_quality(m)
-    return np.stack(
-        [
-            sharpness(sigmas),
-            structure(sigmas),
-            texture,
-            cleanness(m, artifacts),
-            exposed,
-            motion_blur(sigmas),
-            defocus(sigmas),
-            ghosting(m),
-            exposure_failure(exposed),
-            unreliable_texture(m, texture),
-            1.0 - artifacts,
-        ],
-        axis=1,
-    )
+    loss = 1.0 - exposed
+    noiseless = decay(m.noise, _NOISE_HALF, 2.0)
+    intact = decay(m.blocking, _BLOCKING_HALF, 2.0) * decay(m.ringing, _RINGING_HALF, 2.0)
+    cues = {
+        "r_sharpness": decay(sigmas.max(axis=1), _SHARPNESS_HALF, _STEEPNESS),
+        # The mean: motion does not blur edges parallel to it, so that it costs less than equal defocus.
+        "r_structure": decay(sigmas.mean(axis=1), _STRUCTURE_HALF, _STEEPNESS),
+        "r_texture": texture,
+        "r_cleanness": intact * noiseless,
+        "r_exposure": exposed,
+        "b_motion_blur": motion_blur(sigmas),
+        "b_defocus": defocus(sigmas),
+        "b_ghosting": ghosting(m),
+        "b_exposure_failure": loss * loss * (3.0 - 2.0 * loss),  # small losses count less
+        "b_unreliable_texture": 1.0 - texture * noiseless,
+        "b_artifacts": 1.0 - intact,
+    }
+    return np.stack([cues[name] for name in CUE_COLUMNS], axis=1)
 
 
 def over_neighbours(values: ArrayF64, pick: Callable[..., ArrayF64]) -> ArrayF64:  # [n, ...] -> [n, ...]
@@ -172,19 +174,6 @@ def content_detail(m: Measures) -> ArrayF64:  # [n, DIRECTIONS]
     return np.clip(over_neighbours(m.detail, np.max), *_CONTENT_DETAIL)
 
 
-def sharpness(sigmas: ArrayF64) -> ArrayF64:
-    """Return r_sharpness, from the blur in the worst direction."""
-    return decay(sigmas.max(axis=1), _SHARPNESS_HALF, _STEEPNESS)
-
-
-def structure(sigmas: ArrayF64) -> ArrayF64:
-    """Return r_structure (clarity of edges and corners of any orientation), from the mean blur.
-
-    Motion does not blur edges parallel to it, so that motion blur costs less structure than equal defocus.
-    """
-    return decay(sigmas.mean(axis=1), _STRUCTURE_HALF, _STEEPNESS)
-
-
 def texture_reliability(m: Measures, content: ArrayF64) -> ArrayF64:
     """Return r_texture: the share of the content's fine detail that is kept, lower for little contrast.
 
@@ -193,16 +182,6 @@ def texture_reliability(m: Measures, content: ArrayF64) -> ArrayF64:
     """
     kept = (m.detail.mean(axis=1) - 1.0) / (content.mean(axis=1) - 1.0)
     return ramp(kept, _DETAIL) * ramp(m.spread, _CONTRAST)
-
-
-def artifact_freedom(m: Measures) -> ArrayF64:
-    """Return 1 - b_artifacts, from blocks on an 8 px grid and ripples next to strong edges."""
-    return decay(m.blocking, _BLOCKING_HALF, 2.0) * decay(m.ringing, _RINGING_HALF, 2.0)
-
-
-def cleanness(m: Measures, artifacts: ArrayF64) -> ArrayF64:
-    """Return r_cleanness: freedom from noise, blocks and ringing."""
-    return artifacts * decay(m.noise, _NOISE_HALF, 2.0)
 
 
 def exposure_quality(m: Measures) -> ArrayF64:
@@ -216,12 +195,6 @@ def exposure_quality(m: Measures) -> ArrayF64:
     stops = np.abs(np.log2(level / over_neighbours(level, np.median)))
     tonal = np.maximum(ramp(m.mean, _DARK), ramp(m.mean, _BRIGHT))
     return (1.0 - clipped) * (1.0 - tonal) * (1.0 - ramp(stops, _STOPS))
-
-
-def exposure_failure(quality: ArrayF64) -> ArrayF64:
-    """Return b_exposure_failure = x^2 (3 - 2 x) with x = 1 - ``quality``. Small losses count less."""
-    loss = 1.0 - quality
-    return loss * loss * (3.0 - 2.0 * loss)
 
 
 def isotropy(sigmas: ArrayF64) -> ArrayF64:
@@ -260,8 +233,3 @@ def ghosting(m: Measures) -> ArrayF64:
     """
     content = np.minimum(over_neighbours(m.ghosting, np.min), _GHOST_CONTENT)
     return ramp(m.ghosting - content, _GHOST)
-
-
-def unreliable_texture(m: Measures, texture: ArrayF64) -> ArrayF64:
-    """Return b_unreliable_texture: fine detail lost to blur or noise."""
-    return 1.0 - texture * decay(m.noise, _NOISE_HALF, 2.0)
