@@ -18,7 +18,7 @@ from cleargs.progress import Reporter
 from cleargs.rva.config import QwenConfig
 from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, load_view
 from cleargs.rva.tables import CUE_COLUMNS
-from cleargs.rva.vlm.server import EncodedImage, QwenServer, UnscoredError
+from cleargs.rva.vlm.server import QwenServer, UnscoredError
 from cleargs.types import ArrayF64
 
 _MASKED = 127  # mid-grey, as the prompt says
@@ -85,4 +85,4 @@ class QwenEvaluator:
         if mask is not None:
             rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
         masked = mask is not None and not mask.all()
-        return self._server.score(EncodedImage(reduced(rgb, _LONG_SIDE), masked))
+        return self._server.score(reduced(rgb, _LONG_SIDE), masked=masked)

@@ -13,7 +13,6 @@ import os
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from threading import Event
@@ -48,20 +47,6 @@ _RESPONSE_FORMAT = {
     "type": "json_schema",
     "json_schema": {"name": "cues", "strict": True, "schema": reply_schema()},
 }
-
-
-@dataclass(frozen=True, eq=False)
-class EncodedImage:
-    """Image that the model gets."""
-
-    rgb: ImageU8  # [h, w, 3] sRGB
-    masked: bool
-    """True if parts are painted grey."""
-
-    def data_url(self) -> str:
-        """Return the image as the data URL of a PNG. A lossy format would add artifacts."""
-        _, png = cv2.imencode(".png", cv2.cvtColor(self.rgb, cv2.COLOR_RGB2BGR))
-        return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
 
 
 class UnscoredError(Exception):
@@ -147,8 +132,8 @@ class QwenServer:
                 hint=f"choose one with --set rva.qwen.model=NAME, or serve {model}",
             )
 
-    def score(self, image: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
-        """Return the cues of one image.
+    def score(self, rgb: ImageU8, *, masked: bool) -> ArrayF64:  # [h, w, 3] -> [11] in [0, 1]
+        """Return the cues of one sRGB image, as `tables.CUE_COLUMNS`. If ``masked``, parts are painted grey.
 
         After an invalid reply the model gets the error and is asked again, up to `_ASKS` times in all.
 
@@ -156,9 +141,11 @@ class QwenServer:
         """
         if self._abandoned:
             raise UnscoredError(self._abandoned)  # do not wait for the same error again
+        _, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))  # lossless, to add no artifacts
+        url = f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
         content = [
-            {"type": "image_url", "image_url": {"url": image.data_url()}},
-            {"type": "text", "text": prompt_text(masked=image.masked)},
+            {"type": "image_url", "image_url": {"url": url}},
+            {"type": "text", "text": prompt_text(masked=masked)},
         ]
         question: dict[str, Any] = {"role": "user", "content": content}
         messages, fault = [question], ""
