@@ -135,13 +135,18 @@ class Level:
     @cached_property
     def median(self) -> float:
         """Median depth of the render."""
-        return _median_depth(self._pair)
+        depth, alpha = self._pair.depth[::4, ::4], self._pair.alpha[::4, ::4]
+        seen = (alpha > MIN_COVERED) & (depth > 0.0)
+        return float(np.median(depth[seen] / alpha[seen])) if seen.any() else 1.0
 
     @cached_property
     def nearness(self) -> ArrayF32:
-        """Median depth over depth, [H, W]."""
+        """Median depth over depth, [H, W], as in the kernel `displacements`."""
         depth, alpha = (self._reduced(image) for image in (self._pair.depth, self._pair.alpha))
-        return _nearness(depth, alpha, self.median)
+        seen = (alpha > MIN_COVERED) & (depth > 0.0)
+        near = np.ones_like(depth)
+        near[seen] = np.minimum(np.float32(self.median) * alpha[seen] / depth[seen], MAX_NEARNESS)
+        return near
 
     @cached_property
     def _basis(self) -> ArrayF32:
@@ -226,20 +231,6 @@ def _holdout_mask(shape: tuple[int, ...]) -> MaskBool:
     """Return a mask [H, W] of every fourth block, no two of which share a side."""
     row, column = (np.arange(side) // HOLDOUT_BLOCK for side in shape)
     return np.asarray((column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0)
-
-
-def _median_depth(pair: FramePair) -> float:
-    depth, alpha = pair.depth[::4, ::4], pair.alpha[::4, ::4]
-    seen = (alpha > MIN_COVERED) & (depth > 0.0)
-    return float(np.median(depth[seen] / alpha[seen])) if seen.any() else 1.0
-
-
-def _nearness(depth: ArrayF32, alpha: ArrayF32, median: float) -> ArrayF32:
-    """As in the kernel `displacements`."""
-    seen = (alpha > MIN_COVERED) & (depth > 0.0)
-    near = np.ones_like(depth)
-    near[seen] = np.minimum(np.float32(median) * alpha[seen] / depth[seen], MAX_NEARNESS)
-    return near
 
 
 def _high_passed(image: ArrayF32) -> ArrayF32:
