@@ -53,10 +53,6 @@ LOG2_REACH_CUT = LOG2_ALPHA_CUT - 2e-3
 """Lower cut of log2(alpha) for the lists of tiles. Pixels use the exact cut."""
 
 
-def _ssim_window() -> tuple[float, ...]:
-    weights = [math.exp(-(i**2) / (2 * SSIM_SIGMA**2)) for i in range(-SSIM_RADIUS, SSIM_RADIUS + 1)]
-    return tuple(weight / sum(weights) for weight in weights)
-
-
-SSIM_WINDOW = _ssim_window()
+_WEIGHTS = [math.exp(-(i**2) / (2 * SSIM_SIGMA**2)) for i in range(-SSIM_RADIUS, SSIM_RADIUS + 1)]
+SSIM_WINDOW = tuple(weight / sum(_WEIGHTS) for weight in _WEIGHTS)
 """The normalised one-dimensional window, 11 weights."""
