@@ -296,7 +296,7 @@ def check_harm(
     Without ``repaired`` views the scene was trained on raw frames only, as G0 was. No repair can have done
     harm then, so nothing is rendered or scored.
     """
-    views = supervision.holdout_views if repaired else []
+    views = [supervision.views[frame_id] for frame_id in supervision.holdout_ids] if repaired else []
     before, after = g0.fidelity(views, scorer, threads), trained.fidelity(views, scorer, threads, g0)
     return judge_harm(supervision.holdout_ids, before, after, limits)
 

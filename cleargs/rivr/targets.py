@@ -100,11 +100,6 @@ class Supervision:
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property
-    def holdout_views(self) -> list[TrainingView]:
-        """The held-out frames."""
-        return [self.views[frame_id] for frame_id in self.holdout_ids]
-
-    @property
     def candidates(self) -> list[FrameAssessment]:
         """The frames that may be repaired: all except the held-out ones."""
         return [frame for frame in self.assessments if frame.frame_id not in self.holdout_ids]
