@@ -67,14 +67,6 @@ def best_frames(R: ArrayF64, B: ArrayF64, count: int) -> ArrayBool:  # [N] each,
     return chosen
 
 
-def stand_in_set(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> ArrayBool:
-    """Return a mask of the frames that replace an empty set A in the geometry.
-
-    These are the best by R - B: a share `stand_in_share` of the frames, at least one if there are frames.
-    """
-    return best_frames(R, B, max(1, round(config.stand_in_share * len(R))))
-
-
 def standard_roles(R: ArrayF64, B: ArrayF64, G: ArrayF64, config: AssessmentConfig) -> Roles:  # [N] each
     """Return the first role whose conditions hold (strong, geometric, auxiliary), else suppressed."""
     geometric = (config.geometric_G <= G) & (config.geometric_B >= B)

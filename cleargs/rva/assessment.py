@@ -84,7 +84,8 @@ def assess(
     r, b = R[rows], B[rows]
 
     reliable = allocation.is_reliable(r, b, config)
-    stand_in = np.zeros_like(reliable) if reliable.any() else allocation.stand_in_set(r, b, config)
+    stand_ins = 0 if reliable.any() else max(1, round(config.stand_in_share * len(r)))
+    stand_in = allocation.best_frames(r, b, stand_ins)
     reference = reliable | stand_in
     rotations = poses.rotations[rows]
     centres = np.asarray(-np.einsum("nij,ni->nj", rotations, poses.translations[rows]))  # -R^T t
