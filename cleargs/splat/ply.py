@@ -24,17 +24,24 @@ _MAX_LINE_BYTES = 4096  # maximum length of a line in the header
 
 def write_ply(path: Path, scene: Scene) -> None:
     """Write a scene atomically; equal scenes give equal bytes."""
-    gaussians = scene.gaussians.to("cpu")
+    gaussians = scene.gaussians.to("cpu").detach()
     count, coefficients = gaussians.num, gaussians.sh.shape[1]
-    names = _properties(coefficients)
+    names = [  # in the order of the Inria code
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
     rows = np.zeros((count, len(names)), dtype="<f4")
-    rows[:, 0:3] = gaussians.means.detach().numpy()
-    rows[:, 6:9] = gaussians.sh.detach().numpy()[:, 0]
-    by_colour = gaussians.sh.detach().numpy()[:, 1:].transpose(0, 2, 1)  # [N, 3, K - 1]
+    rows[:, 0:3] = gaussians.means.numpy()
+    rows[:, 6:9] = gaussians.sh.numpy()[:, 0]
+    by_colour = gaussians.sh.numpy()[:, 1:].transpose(0, 2, 1)  # [N, 3, K - 1]
     rows[:, 9:-8] = by_colour.reshape(count, 3 * (coefficients - 1))
-    rows[:, -8] = gaussians.logit_opacities.detach().numpy()
-    rows[:, -7:-4] = gaussians.log_scales.detach().numpy()
-    rows[:, -4:] = gaussians.rotations.detach().numpy()
+    rows[:, -8] = gaussians.logit_opacities.numpy()
+    rows[:, -7:-4] = gaussians.log_scales.numpy()
+    rows[:, -4:] = gaussians.rotations.numpy()
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -92,18 +99,6 @@ def read_ply(path: Path) -> Scene:
             f"cannot read the scene {path}: {cause(error)}",
             hint="repeat the stage that wrote it with --force",
         ) from error
-
-
-def _properties(coefficients: int) -> list[str]:
-    """Return the property names in the order of the Inria code, for this number of SH terms per channel."""
-    return [
-        *("x", "y", "z", "nx", "ny", "nz"),
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))),
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
 
 
 def _read_header(file: BinaryIO) -> tuple[int, list[str], dict[str, str]]:
