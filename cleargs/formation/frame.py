@@ -94,43 +94,27 @@ def described(frame: FrameFormation) -> str:
 
 
 def fit_motion(
-    frame: FrameFormation,
+    frame: FrameFormation,  # the formation so far, whose model remains a candidate
     config: FormationConfig,
-    camera: Camera,
-    affine: Tensor | None,
-    target: Tensor,
-    mask: Tensor | None,
-    render: Renderer,
+    camera: Camera,  # the frame's, reduced by ``factor``
+    affine: Tensor | None,  # [3, 4] colour of the frame
+    target: Tensor,  # [H, W, 3] sRGB, the frame
+    mask: Tensor | None,  # [H, W]
+    render: Renderer,  # renders the scene with depth
     *,
-    factor: float = 1.0,
-    pose: bool = False,
-    doubted: bool = False,
-    rolling: bool = False,
-    test_rolling: bool = False,
-    again: bool = False,
-    draft: bool = False,
+    factor: float = 1.0,  # size of ``camera`` over that of the frame
+    pose: bool = False,  # correct the pose together with a motion
+    doubted: bool = False,  # RVA doubts the frame, so less evidence is needed for a search
+    rolling: bool = False,  # admit models with a skew
+    test_rolling: bool = False,  # measure `skew_gain` even where no such model is admitted
+    again: bool = False,  # try a higher order, and search a frame with a curved path or a rolling shutter
+    draft: bool = False,  # search the first time, too, only if the test finds blur
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
     The first time, the frame is searched. Later a known formation is refined, and the frame is searched only
     if the test of `pretest` finds blur that the present model does not explain and that the last search did
     not leave, or if a rolling shutter is asked for, since the test cannot see a skew.
-
-    Args:
-        frame: The formation so far. Its model remains a candidate.
-        config: Settings.
-        camera: Camera of the frame, reduced by ``factor``.
-        affine: The frame's colour, [3, 4].
-        target: The frame, [H, W, 3] sRGB.
-        mask: Its mask, [H, W].
-        render: Renders the scene with depth.
-        factor: Size of ``camera`` over that of the frame.
-        pose: Correct the pose together with a motion.
-        doubted: RVA doubts the frame, so less evidence is needed for a search.
-        rolling: Admit models with a skew.
-        test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
-        again: Try a path of a higher order, and search a frame with a curved path, or of a rolling shutter.
-        draft: Search the first time, too, only if the test finds blur.
     """
     # A formation that was found under the other assumption about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
