@@ -76,32 +76,20 @@ def relative_error(
 
 
 def refine(
-    arrays: Arrays,
-    moments: Sequence[Arrays],
+    arrays: Arrays,  # parameters; they are changed and must not be used again
+    moments: Sequence[Arrays],  # running means of the optimiser, likewise; 0 for both halves after a split
     *,
     errors: Any,  # [N] float64 >= 0
-    rate: float,
-    budget: int,
-    min_opacity: float,
+    rate: float,  # maximum growth, as a fraction of N
+    budget: int,  # maximum number of Gaussians after the growth
+    min_opacity: float,  # opacity up to which a Gaussian is dead
     rng: Draws,
-    xp: Any = np,
+    xp: Any = np,  # module of the arrays, numpy or torch
 ) -> tuple[Arrays, list[Arrays]]:
     """Split live Gaussians, drawn in proportion to their errors, in `ROUNDS` rounds.
 
-    The first half stays in place. The second half replaces a dead Gaussian, or is appended.
-
-    Args:
-        arrays: Parameters by name, first axis N. They are changed and must not be used again.
-        moments: Running means of the optimiser; 0 for both halves after a split. They are changed, too.
-        errors: Error of each Gaussian.
-        rate: Maximum growth, as a fraction of N.
-        budget: Maximum number of Gaussians after the growth.
-        min_opacity: Opacity up to which a Gaussian is dead.
-        rng: Source of the draws.
-        xp: The module of the arrays, numpy or torch.
-
-    Returns:
-        The new parameters and moments.
+    The first half stays in place. The second half replaces a dead Gaussian, or is appended. Returns the
+    new parameters and moments.
     """
     running, start = list(moments), len(errors)
     growth = max(0, min(budget, int((1.0 + rate) * start)) - start)
