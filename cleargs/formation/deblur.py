@@ -28,7 +28,12 @@ MIN_LINEAR = 0.002
 """Linear light below which the slope of sRGB is taken as here."""
 
 
-def deblur(render: ArrayF32, observed: ArrayF32, weight: ArrayF32, warp: Warp) -> ArrayF32:
+def deblur(
+    render: ArrayF32,  # R, sRGB in [0, 1], larger than the frame by the warp's margin on every side
+    observed: ArrayF32,  # O, [H, W, 3] sRGB in [0, 1]
+    weight: ArrayF32,  # [H, W], 0 where a pixel of ``observed`` does not count
+    warp: Warp,
+) -> ArrayF32:  # [H, W, 3] sRGB in [0, 1]
     """Return the sharp image that explains ``observed`` under the frame's formation B.
 
     It is that of ``render`` where B leaves it undetermined:
@@ -37,15 +42,6 @@ def deblur(render: ArrayF32, observed: ArrayF32, weight: ArrayF32, warp: Warp) -
 
     s is the slope of sRGB over linear light, so that differences count as they are seen. Solved by conjugate
     gradients from X = R.
-
-    Args:
-        render: R, [H, W, 3] sRGB in [0, 1], larger than the frame by the warp's margin on every side.
-        observed: O, [H, W, 3] sRGB in [0, 1].
-        weight: [H, W], 0 where a pixel of ``observed`` does not count.
-        warp: B and its transpose.
-
-    Returns:
-        [H, W, 3] sRGB in [0, 1], of the frame's size.
     """
     start, target = padded(linear_from_srgb(render)), padded(linear_from_srgb(observed))
     forward, transpose = _on_arrays(warp.forward, warp), _on_arrays(warp.transpose, warp)

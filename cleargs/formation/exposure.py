@@ -47,9 +47,7 @@ class Exposure:
     def from_gains(cls, frame_ids: Sequence[int], gains: NDArray[np.float64]) -> Exposure:
         """Return the exposure that brightens each frame by its gain over the median gain.
 
-        Args:
-            frame_ids: Distinct frames.
-            gains: [F]; NaN for a frame that is not changed.
+        Frames are distinct. A gain [F] is NaN for a frame that is not changed.
         """
         known = gains[np.isfinite(gains)]
         relative = gains / np.median(known) if len(known) else gains

@@ -115,13 +115,8 @@ def pixel_paths(
 ) -> ArrayF64:  # [T, rows, columns, 2] px
     """Return the displacements of the pixels at the centres of a grid at ``times`` of the exposure.
 
-    They are those at the median depth, relative to the mean of the exposure.
-
-    Args:
-        motion: The frame's motion.
-        camera: Its camera.
-        shape: Rows and columns of the grid.
-        times: Times from -1/2 to 1/2.
+    They are those at the median depth, relative to the mean of the exposure. ``shape`` are rows and columns
+    of the grid. Times are from -1/2 to 1/2.
     """
     basis = flow_basis(camera, np.ones(shape, np.float32)).astype(np.float64)
     basis *= np.array([camera.width / shape[1], camera.height / shape[0]])[:, None, None]
