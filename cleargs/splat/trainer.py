@@ -66,34 +66,22 @@ class Trained:
 class Trainer:
     """A training of a scene on weighted views. `run` performs all steps.
 
-    Args:
-        scene: Scene to start from; it is copied.
-        views: Training views. Those with weight 0 are ignored.
-        config: Settings; open steps and budget follow from the views.
-        seed: Seed of all random numbers.
-        formation: Image formation that is applied to the renders, and updated by the training (None: renders
-            are compared as they are).
-        moments: Moments of Adam at the end of the previous part of the schedule (None: zero).
-        pseudo_share: Fraction of the steps that use a pseudo view.
-        pseudo_weight: Factor on the loss of pseudo views.
-        device: Device of the training: ``cpu`` or ``cuda``.
-
     Raises:
         InputError: All weights are 0, or the scene is not finite.
     """
 
     def __init__(
         self,
-        scene: Scene,
-        views: Sequence[TrainingView],
-        config: TrainConfig,
+        scene: Scene,  # to start from; it is copied
+        views: Sequence[TrainingView],  # those with weight 0 are ignored
+        config: TrainConfig,  # open steps and budget follow from the views
         *,
         seed: Sequence[int],
-        formation: Formation | None = None,
-        moments: Moments | None = None,
-        pseudo_share: float = 0.0,
-        pseudo_weight: float = 1.0,
-        device: str = "cpu",
+        formation: Formation | None = None,  # is updated; None: renders are compared as they are
+        moments: Moments | None = None,  # Adam's, at the end of the previous part of the schedule; None: zero
+        pseudo_share: float = 0.0,  # fraction of the steps that use a pseudo view
+        pseudo_weight: float = 1.0,  # factor on the loss of pseudo views
+        device: str = "cpu",  # or ``cuda``
     ) -> None:
         weighted = [view for view in views if view.weight > 0.0]
         self._real = [view for view in weighted if view.kind == "real"]
