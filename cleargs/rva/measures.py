@@ -82,19 +82,16 @@ def erode_valid(valid: MaskBool, radius: int) -> MaskBool:
 
 
 def detail_ratios(
-    luminance: PlaneF32, valid: MaskBool, noise: float
-) -> ArrayF64:  # [h, w], [h, w] -> [DIRECTIONS]
+    luminance: PlaneF32,  # [h, w] luma, 0 to 255
+    valid: MaskBool,  # [h, w] pixels to measure
+    noise: float,  # standard deviation of the noise, levels of 255; its energy is subtracted
+) -> ArrayF64:  # [DIRECTIONS]
     """Return the mean over the tiles of u' T(FINE) u / u' T(COARSE) u per direction k pi / DIRECTIONS.
 
     It is about 3 for sharp step edges, up to 9 for fine texture, closer to 1 for stronger blur, and 0 without
     structure along a direction. Failure modes: soft content (shadows, clouds, out-of-focus background) looks
     like blur; `statistics` therefore compares with neighbouring frames. Dense noise or grain in dark areas
     looks like detail if `noise_level` misses it.
-
-    Args:
-        luminance: Luma, 0 to 255.
-        valid: Pixels to measure.
-        noise: Standard deviation of the noise, levels of 255. Its energy is subtracted.
     """
     inner = erode_valid(valid, _MARGIN)
     share = _tile_means(inner.astype(np.float32))
