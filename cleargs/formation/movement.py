@@ -68,16 +68,13 @@ MOVEMENT = pa.schema(
 
 
 class Movement:
-    """Movement in the frames of a capture, found while a scene is trained.
-
-    Args:
-        cameras: Cameras of the frames, by frame_id, at full size.
-        tolerance: Difference of mean colours, sRGB in [0, 1], up to which nothing moves; 0: never.
-        known: Cells [rows, columns] that move, by frame_id, from an earlier training.
-    """
+    """Movement in the frames of a capture, found while a scene is trained."""
 
     def __init__(
-        self, cameras: Mapping[int, Camera], tolerance: float, known: Mapping[int, MaskBool] | None = None
+        self,
+        cameras: Mapping[int, Camera],  # by frame_id, at full size
+        tolerance: float,  # difference of mean colours, sRGB in [0, 1], up to which nothing moves; 0: never
+        known: Mapping[int, MaskBool] | None = None,  # [rows, columns] cells that an earlier training found
     ) -> None:
         self._tolerance = tolerance
         self._place = {frame_id: k for k, frame_id in enumerate(cameras)}
