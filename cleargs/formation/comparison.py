@@ -19,7 +19,7 @@ from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
-from cleargs.types import ArrayF32, ArrayF64, MaskBool
+from cleargs.types import ArrayF32, ArrayF64
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
@@ -120,7 +120,8 @@ class Level:
         observed[inner], weight[inner] = pair.observed, pair.weight
         self._image, self._observed = _high_passed(reduced(pair.luminance)), _high_passed(reduced(observed))
         counted = (reduced(weight) > 0.99).astype(np.float32)
-        holdout = _holdout_mask(counted.shape)
+        row, column = (np.arange(side) // HOLDOUT_BLOCK for side in counted.shape)
+        holdout = (column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0  # no two blocks share a side
         self._fitting, self._holdout = counted * ~holdout, counted * holdout
         if not self._holdout.any():  # an image of a few blocks
             self._holdout = self._fitting = counted
@@ -225,12 +226,6 @@ class Level:
 def finest_level(pair: FramePair) -> Level:
     """Return the problem at the largest size at which a frame is compared."""
     return Level(pair, scales(pair)[-1])
-
-
-def _holdout_mask(shape: tuple[int, ...]) -> MaskBool:
-    """Return a mask [H, W] of every fourth block, no two of which share a side."""
-    row, column = (np.arange(side) // HOLDOUT_BLOCK for side in shape)
-    return np.asarray((column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0)
 
 
 def _high_passed(image: ArrayF32) -> ArrayF32:
