@@ -118,16 +118,11 @@ class Trainer:
     def run(
         self, *, checkpoint: Path, reporter: Reporter, label: str = "training", round: int = 0
     ) -> Trained:
-        """Train to the end.
+        """Train to the end, and return the result. ``label`` is the name of the training in messages.
 
-        After a SIGTERM, if the program has a handler for it, the training saves a checkpoint and stops.
-
-        Args:
-            checkpoint: File of the checkpoints, each with a preview next to it. If the file belongs to this
-                training, the training resumes from it; the result is the same bit for bit.
-            reporter: Receiver of progress and messages.
-            label: Name of the training in messages.
-            round: Round of the stage, a column of the log.
+        If the file ``checkpoint`` belongs to this training, the training resumes from it; the result is the
+        same bit for bit. A preview is written next to it. After a SIGTERM, if the program has a handler for
+        it, the training saves a checkpoint and stops. ``round`` is a column of the log.
 
         Raises:
             StageError: A parameter or the loss is not finite.
@@ -238,11 +233,7 @@ class Trainer:
             self._densify()
 
     def preview(self) -> Tensor:
-        """Render the current scene, reduced, from the view with the largest weight.
-
-        Returns:
-            Image [H, W, 3] sRGB, valid until the next step.
-        """
+        """Return a reduced image [H, W, 3] sRGB of the view with the largest weight, valid for one step."""
         view = max(self._real or self._pseudo, key=lambda view: view.weight)
         camera = view.camera.scaled(min(1.0, PREVIEW_SIDE / max(view.camera.width, view.camera.height)))
         return self._render(camera, depth=False).image
