@@ -17,28 +17,17 @@ from cleargs.types import ArrayF64, ImageU8
 
 
 def render(
-    gaussians: Gaussians,
+    gaussians: Gaussians,  # float32
     camera: Camera,
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    sh_degree: int | None = None,
-    antialias: bool = False,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),  # sRGB behind the Gaussians, from 0 to 1
+    sh_degree: int | None = None,  # largest SH degree in use; None: the stored one
+    antialias: bool = False,  # apply the opacity compensation of Mip-Splatting (Yu et al. 2024)
 ) -> Render:
     """Render image, alpha and depth, differentiable in the five parameters.
 
     The device of the tensors chooses the kernels. Each call allocates its own buffers: use `Rasteriser` for
-    training loops.
-
-    Args:
-        gaussians: Float32 Gaussians.
-        camera: Camera of the view.
-        background: Colour behind the Gaussians, sRGB from 0 to 1.
-        sh_degree: Largest SH degree in use; None for the stored one.
-        antialias: Apply the opacity compensation of Mip-Splatting (Yu et al. 2024).
-
-    Returns:
-        Image [H, W, 3], sRGB as the scene stores it, not clamped above 1. Alpha [H, W]. Accumulated depth [H,
-        W]: the sum of weight times camera z, in scene units. Divide it by alpha for a mean.
+    training loops. The image is not clamped above 1. Divide the accumulated depth by alpha for a mean.
 
     Raises:
         InputError: There is no back end for the device, the parameters are not float32, or the SH degree is
