@@ -69,11 +69,8 @@ class Schedule:
 
     def rate_of_means(self, step: int) -> float:
         """Return the learning rate of the means."""
-        return (
-            self._factor
-            * self._config.lr_means
-            * float(self._config.lr_means_final ** (step / self._config.planned))
-        )
+        decay = float(self._config.lr_means_final ** (step / self._config.planned))
+        return self._factor * self._config.lr_means * decay
 
     def rates(self, step: int) -> dict[str, Rate]:
         """Return every learning rate by parameter name."""
