@@ -41,9 +41,8 @@ def select_holdout(frames: Sequence[FrameAssessment], share: float = 0.125) -> l
     the middle of the part. Soft frames are not selected, since they would count every gain in sharpness as a
     loss.
     """
-    references = [frame for frame in frames if frame.reliable] or [
-        frame for frame in frames if frame.stand_in
-    ]
+    reliable = [frame for frame in frames if frame.reliable]
+    references = reliable or [frame for frame in frames if frame.stand_in]
     if not references or share == 0.0:
         return []
     count = max(1, int(len(references) * share))
@@ -57,8 +56,7 @@ def _parts(count: int, parts: int) -> Iterator[tuple[int, int]]:
 
 def _best(frames: Sequence[FrameAssessment]) -> FrameAssessment:
     middle = len(frames) // 2
-    ranked = sorted(enumerate(frames), key=lambda item: (item[1].B - item[1].R, abs(item[0] - middle)))
-    return ranked[0][1]
+    return min(enumerate(frames), key=lambda item: (item[1].B - item[1].R, abs(item[0] - middle)))[1]
 
 
 @dataclass(frozen=True)
