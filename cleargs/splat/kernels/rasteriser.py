@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -74,9 +75,7 @@ class Buffers:
 
     def take(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return a contiguous tensor of this shape in the memory called ``name``."""
-        size = 1
-        for side in shape:
-            size *= side
+        size = math.prod(shape)
         memory = self.memory.get(name)
         if memory is None or memory.numel() < size or memory.dtype != dtype:
             # A quarter more than needed, so that slow growth does not allocate at every step. The old memory
