@@ -112,7 +112,8 @@ def _fitted(
     def fit(shape: ArrayF64) -> tuple[float, ArrayF64]:
         """Return the squared error on unseen tiles, and the mean of the numbers [7]."""
         numbers = [_solved(fitting, shape) for fitting, _ in halves]
-        errors = [_error(judging, x) for (_, judging), x in zip(halves, numbers, strict=True)]
+        left = [np.append(x, -1.0) for x in numbers]
+        errors = [float(x @ judging @ x) for (_, judging), x in zip(halves, left, strict=True)]
         return math.fsum(errors), np.mean(numbers, axis=0)
 
     still = np.eye(_ALL)[:, :_STILL]
@@ -141,8 +142,3 @@ def _solved(sums: ArrayF64, shape: ArrayF64) -> ArrayF64:
     matrix = matrix / scale / scale[:, None] + _RIDGE * np.eye(len(matrix))
     solution = np.linalg.solve(matrix, shape.T @ sums[:_ALL, _ALL] / scale)
     return np.asarray(shape @ (solution / scale))
-
-
-def _error(sums: ArrayF64, numbers: ArrayF64) -> float:
-    left = np.append(numbers, -1.0)
-    return float(left @ sums @ left)
