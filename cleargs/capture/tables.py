@@ -99,13 +99,8 @@ def load_points(ingest_dir: Path) -> Points:
     """Return the sparse points of a finished ingest folder. Raises StoreError."""
     table = read_table(ingest_dir / "points.parquet", POINTS)
     get = {name: table.column(name).to_numpy() for name in POINTS.names}
-    return Points(
-        point_id=get["point_id"],
-        xyz=np.stack([get["x"], get["y"], get["z"]], axis=1),
-        rgb=np.stack([get["r"], get["g"], get["b"]], axis=1),
-        error=get["error"],
-        track_length=get["track_length"],
-    )
+    xyz, rgb = (np.stack([get[name] for name in names], axis=1) for names in ("xyz", "rgb"))
+    return Points(get["point_id"], xyz, rgb, get["error"], get["track_length"])
 
 
 def load_observations(ingest_dir: Path) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
