@@ -97,9 +97,8 @@ def frame_gains(views: Sequence[TrainingView], sparse: SparsePoints) -> NDArray[
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         image, mask = view.load()
         rows, columns = row[inside].astype(np.int64), column[inside].astype(np.int64)
-        shown = image[rows, columns].astype(np.float64).sum(axis=1) * (
-            1.0 if image.dtype == np.uint8 else 255.0
-        )
+        white = 1.0 if image.dtype == np.uint8 else 255.0
+        shown = image[rows, columns].astype(np.float64).sum(axis=1) * white
         mean = sparse.rgb[seen][inside].astype(np.float64).sum(axis=1)
         usable = (mean > 30.0) & (mean < 735.0)  # near black and white a ratio says nothing about exposure
         if mask is not None:

@@ -164,7 +164,6 @@ def evaluate_views(
         image = render_observed(scene, view, exposure, formations.get(view.frame_id), engine=engine)
         unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
         unseen = unseen if mask is None else unseen & mask
-        fits.append(
-            Fit(psnr(image, target, mask), psnr(image, target, unseen) if bool(unseen.any()) else None)
-        )
+        psnr_unseen = psnr(image, target, unseen) if bool(unseen.any()) else None
+        fits.append(Fit(psnr(image, target, mask), psnr_unseen))
     return fits

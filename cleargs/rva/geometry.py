@@ -28,10 +28,8 @@ def view_angle(chord: ArrayF64) -> ArrayF64:
 
 def largest_distance(points: ArrayF64) -> float:  # [N, 3]
     """Return the largest distance between two points; 0 for fewer than two points."""
-    return max(
-        (float(cdist(points[rows], points).max()) for rows in _row_blocks(len(points), len(points))),
-        default=0.0,
-    )
+    blocks = _row_blocks(len(points), len(points))
+    return max((float(cdist(points[rows], points).max()) for rows in blocks), default=0.0)
 
 
 def pose_diversity(
@@ -54,9 +52,8 @@ def pose_diversity(
         angle = view_angle(cdist(directions[rows], directions[others]))
         distance = cdist(centres[rows], centres[others]) / scale if scale > 0.0 else np.zeros_like(angle)
         pair = config.gamma_c * distance + config.gamma_v * angle
-        pair[rows[:, None] == others[None, :]] = (
-            0.0  # exclude j = i: 0 does not change a maximum of distances
-        )
+        # Exclude j = i: 0 does not change a maximum of distances.
+        pair[rows[:, None] == others[None, :]] = 0.0
         D[rows] = pair.max(axis=1)
     return D
 

@@ -91,7 +91,6 @@ def _columns(scene: Scene) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]
     }
     for degree in range(gaussians.sh_degree + 1):
         for index in range(2 * degree + 1):
-            columns[f"{_NAME}:SH_DEGREE_{degree}_COEF_{index}"] = np.ascontiguousarray(
-                sh[:, degree**2 + index]
-            )
+            name = f"{_NAME}:SH_DEGREE_{degree}_COEF_{index}"
+            columns[name] = np.ascontiguousarray(sh[:, degree**2 + index])
     return columns

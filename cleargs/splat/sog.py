@@ -162,9 +162,8 @@ def palette(
     labels = np.empty(len(vectors), np.int64)
     for index, members in enumerate(groups):
         labels[members] = index
-    return np.stack([vectors[members].mean(axis=0, dtype=np.float64) for members in groups]).astype(
-        np.float32
-    ), labels
+    means = np.stack([vectors[members].mean(axis=0, dtype=np.float64) for members in groups])
+    return means.astype(np.float32), labels
 
 
 def _spread(vectors: NDArray[np.float32], members: NDArray[np.int64], index: int) -> tuple[float, int, int]:

@@ -74,9 +74,8 @@ def transform_scene(
         raise ValueError("not a similarity: the scale must be positive, the rotation proper")
     gaussians = scene.gaussians.detach()
     turn = torch.from_numpy(np.ascontiguousarray(rotation, dtype=np.float64))
-    means = scale * gaussians.means.double() @ turn.T + torch.from_numpy(
-        np.asarray(translation, dtype=np.float64)
-    )
+    shift = torch.from_numpy(np.asarray(translation, dtype=np.float64))
+    means = scale * gaussians.means.double() @ turn.T + shift
     quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)  # x y z w -> w x y z
     mixing = sh_rotation(turn, gaussians.sh.shape[1])
     transformed = Gaussians(

@@ -105,9 +105,8 @@ def adam_step(
 def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
     if opacity > 0.0:
         opacities = densification.sigmoid(gaussians.logit_opacities.numpy())
-        gradients.logit_opacities.numpy()[:] += (
-            np.float32(opacity / gaussians.num) * opacities * (1 - opacities)
-        )
+        weight = np.float32(opacity / gaussians.num)
+        gradients.logit_opacities.numpy()[:] += weight * opacities * (1 - opacities)
     if scale > 0.0:
         scales = np.exp(gaussians.log_scales.numpy())
         gradients.log_scales.numpy()[:] += np.float32(scale / scales.size) * scales
