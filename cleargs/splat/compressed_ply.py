@@ -131,12 +131,10 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
 
 def smallest_three(
     quaternions: NDArray[np.floating[Any]],  # [N, 4]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return three components of each quaternion, from which a decoder can compute the fourth.
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # [N], [N, 3]
+    """Return the index of each quaternion's largest component, and the others of the normalised one in order.
 
-    Returns:
-        Index of the largest component [N], and the other components of the normalised quaternion in their
-        order [N, 3]. Their signs are those for which the largest component is positive.
+    Their signs are those for which the largest component, which a decoder can compute, is positive.
     """
     unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)

@@ -139,14 +139,11 @@ def nearest(centres: NDArray[np.float32], values: NDArray[np.float32]) -> ImageU
 def palette(
     vectors: NDArray[np.float32],  # [N, D]
     size: int,
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Approximate vectors by a palette.
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:  # [K, D], [N]
+    """Return K <= ``size`` vectors, and for each of the N vectors the index of the one that replaces it.
 
     The group with the largest sum of squared deviations is split at its mean, along the axis with the largest
     variance, until there are ``size`` groups: N D log K operations, where a round of k-means costs N D K.
-
-    Returns:
-        Palette of K <= ``size`` vectors [K, D], and the index of its vector for each of the N vectors [N].
     """
     groups = [np.arange(len(vectors))]
     heap = [_spread(vectors, groups[0], 0)]
