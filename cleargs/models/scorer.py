@@ -174,13 +174,9 @@ def patches(image: ImageF32) -> tuple[NDArray[np.float32], NDArray[np.int64], ND
         ratio = side / max(height, width)
         extent = (round(height * ratio), round(width * ratio))
         sizes.append(interpolate(planes, extent, mode="bicubic", align_corners=False))
-    cut = [_cut(resized[0].numpy()) for resized in (*sizes, planes)]
-    scales = [np.full(len(cells), number) for number, (_, cells) in enumerate(cut)]
-    return (
-        np.concatenate([tiles for tiles, _ in cut]),
-        np.concatenate([cells for _, cells in cut]),
-        np.concatenate(scales),
-    )
+    tiles, cells = zip(*(_cut(resized[0].numpy()) for resized in (*sizes, planes)), strict=True)
+    scales = [np.full(len(those), number) for number, those in enumerate(cells)]
+    return np.concatenate(tiles), np.concatenate(cells), np.concatenate(scales)
 
 
 def _cut(planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
