@@ -25,7 +25,6 @@ from cleargs.types import ImageF32
 COEFFICIENTS = "naturalness.toml"
 
 _TILE = 128  # px; side of the patches to which the quadratic was fitted
-_SCALES = 2
 _WINDOW_SIGMA = 7.0 / 6.0  # px, as in BRISQUE
 _STABILISER = 1.0 / 255.0  # keeps the division finite in areas without contrast
 _MAX_DEVIATIONS = 4.0  # features are clipped at these deviations: a quadratic must not extrapolate
@@ -84,13 +83,8 @@ def features(image: ImageF32) -> NDArray[np.float64]:  # [H, W, 3] sRGB in [0, 1
     (mean), and along the diagonals (mean); and the logarithm of the mean local contrast.
     """
     luma = image @ _BT601
-    statistics: list[float] = []
-    for scale in range(_SCALES):
-        if scale:
-            half = cv2.resize(luma, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            luma = np.asarray(half, np.float32)
-        statistics += _scale_features(luma)
-    return np.array(statistics)
+    half = cv2.resize(luma, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return np.array([*_scale_features(luma), *_scale_features(np.asarray(half, np.float32))])
 
 
 def terms(
