@@ -73,9 +73,8 @@ def choose(
     """
     if not np.isfinite([*primary.values(), *tiebreak.values()]).all():
         raise ValueError(f"scores must be finite: primary {dict(primary)}, tie-break {dict(tiebreak)}")
-    names = [name for name in CANDIDATES if name in primary]
     best = max(primary.values())
-    close = [name for name in names if best - primary[name] <= margin]
+    close = [name for name in CANDIDATES if name in primary and best - primary[name] <= margin]
     if len(close) == 1:
         return CandidateChoice(close[0], "primary score")
     chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))

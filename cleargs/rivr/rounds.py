@@ -42,9 +42,7 @@ from cleargs.types import ImageF32, MaskBool
 PREFIX = "cleargs:"
 """Prefix of the names of the attributes in the EXR."""
 
-_OPTIONAL = (
-    *("primary_fused", "primary_observed", "tiebreak_fused", "tiebreak_observed", "blur_px", "skew_px"),
-)
+_OPTIONAL = ("primary_fused", "primary_observed", "tiebreak_fused", "tiebreak_observed", "blur_px", "skew_px")
 """Attributes that an EXR has only where its candidates do."""
 
 TRUSTED = 0.5

@@ -146,9 +146,7 @@ def round_figures(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
         "refused": dict(Counter(row.reason for row in refused)),
         "repairs_refused": refused_repairs(rows),
         "tie_breaks": sum(row.reason.startswith("tie-break") for row in rows),
-        "scorers": {name: getattr(tried[0], f"{name}_metric") for name in ("primary", "tiebreak")}
-        if tried
-        else {},
+        "scorers": {name: getattr(tried[0], f"{name}_metric") for name in ("primary", "tiebreak") if tried},
         "mean_scores": means,
     }
 

@@ -43,8 +43,7 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 def compressed_ply(scene: Scene) -> bytes:
     """Encode a scene, with its Gaussians in Morton order; equal scenes give equal bytes."""
     gaussians = scene.gaussians.to("cpu").detach()
-    order = morton_order(gaussians.means.numpy())
-    gaussians = gaussians.select(torch.from_numpy(order))
+    gaussians = gaussians.select(torch.from_numpy(morton_order(gaussians.means.numpy())))
     count, coefficients = gaussians.num, gaussians.sh.shape[1]
     ranges, packed = _chunks(gaussians)
     rest = 3 * (coefficients - 1)
