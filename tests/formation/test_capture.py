@@ -271,7 +271,7 @@ def test_later_only_a_frame_with_evidence_is_searched(tmp_path: Path, searched: 
 def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
     tmp_path: Path, searched: list[FramePair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All frames have noise. The test is replaced by one that takes each for blurred by 7 px across."""
+    """All frames have noise. The test is replaced by one that sees a blur of 7 px across in each."""
     found = BlurEvidence(line_gain=0.2, line=49.0 / 12.0, angle=0.0, disc_gain=0.0, disc=0.0)
     monkeypatch.setattr("cleargs.formation.frame.blur_evidence", lambda *_: found)
     rng = np.random.default_rng(0)
