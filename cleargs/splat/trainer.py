@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -197,16 +197,16 @@ class Trainer:
         config, view, schedule_step = self._config, self._view(self.done), self._schedule_step
         factor = self._schedule.image_factor(schedule_step)
         target, mask = self._cache.get(view, factor)
-        formed, render_with_depth = None, partial(self._render, depth=True)
+        colour = random_grey(self._seed, schedule_step) if config.background is None else None
+        formed, looks = None, _Looks(partial(self._render, depth=True), colour, self._scene.background)
         if self._formation is not None:
             progress = schedule_step / config.planned
-            formed = self._formation.form(view, factor, progress, target, mask, render_with_depth)
+            formed = self._formation.form(view, factor, progress, target, mask, looks.render)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
         depth = formed is not None and formed.needs_depth
-        colour = random_grey(self._seed, schedule_step) if config.background is None else None
-        render = self._render(camera, depth=depth, background=colour)
+        render = looks.last_of(camera) or self._render(camera, depth=depth, background=colour)
         image = render.image if formed is None else formed.forward(render)
         mask = mask if formed is None else formed.mask
         image, too_bright = recorded(image, target)
@@ -379,6 +379,28 @@ class Trainer:
             f"{fault} at step {self.done}; the last good checkpoint is kept",
             hint="lower the rates (lr_scales, lr_means), or use another --seed",
         )
+
+
+class _Looks:
+    """Renders for image formation within one step. The last one also serves the step, if its camera does."""
+
+    def __init__(self, render: Callable[..., Render], colour: Colour | None, background: Colour) -> None:
+        self._render, self._colour, self._background = render, colour, background
+        self._last: tuple[Camera, Render] | None = None
+
+    def render(self, camera: Camera) -> Render:
+        """Return a render with depth over the background of the scene."""
+        render = self._render(camera, background=self._colour)
+        self._last = camera, render
+        if self._colour is None:
+            return render
+        change = torch.tensor(self._background) - torch.tensor(self._colour)
+        empty = (1.0 - render.alpha)[..., None]
+        return render._replace(image=render.image + empty * change.to(empty.device))
+
+    def last_of(self, camera: Camera) -> Render | None:
+        """Return the last render if it is of ``camera``, over the colour of the step."""
+        return self._last[1] if self._last is not None and self._last[0].shows_as(camera) else None
 
 
 def _next_save(begun: float, ended: float) -> float:

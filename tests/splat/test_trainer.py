@@ -32,7 +32,7 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trained, Trainer
-from cleargs.splat.types import Moments
+from cleargs.splat.types import Moments, Render
 from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
 CONFIG = TrainConfig(
@@ -255,6 +255,37 @@ def looking(scene: Scene, pictures: list[np.ndarray]) -> Trainer:
     while trainer.done < 15:
         trainer.step()
     return trainer
+
+
+def test_the_render_of_a_look_serves_the_step_too(
+    pictures: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look sees the scene over black, and the step the same render over its colour."""
+    looks: list[torch.Tensor] = []
+
+    class Looking(CaptureFormation):
+        def form(self, view: TrainingView, factor: float, *rest: Any) -> Any:
+            looks.append(rest[-1](view.camera.scaled(factor)).image.clone())
+            return super().form(view, factor, *rest)
+
+    config = CONFIG.model_copy(update={"coarse_share": 0.0})
+    formation = Looking(views(pictures), FormationConfig(enabled=False))
+    trainer = Trainer(start(), views(pictures), config, seed=(7,), formation=formation)
+    plain = Trainer(start(), views(pictures), config, seed=(7,))
+    made: list[Render] = []
+    keep_render = trainer._rasteriser.view
+    monkeypatch.setattr(
+        trainer._rasteriser, "view", lambda *a, **k: made.append(keep_render(*a, **k)) or made[-1]
+    )
+    for number in range(8):
+        camera = trainer._view(number).camera
+        over_black = render(trainer.scene.gaussians, camera, sh_degree=trainer._sh_degree()).image
+        trainer.step()
+        plain.step()
+        assert len(made) == number + 1
+        torch.testing.assert_close(looks[-1], over_black, atol=1e-6, rtol=0.0)  # float32, up to 1.5
+    for name, tensor in plain.scene.gaussians.tensors().items():
+        assert torch.equal(tensor, trainer.scene.gaussians.tensors()[name]), name
 
 
 def test_errors_go_to_the_gaussians_that_cause_them(pictures: list[np.ndarray]) -> None:
