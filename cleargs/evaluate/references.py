@@ -90,29 +90,18 @@ class Reference:
 
 
 def reference_of(
-    run: Path | None,
-    directory: Path | None,
+    run: Path | None,  # None: the scene is in the world of ``directory``
+    directory: Path | None,  # has ``images/`` and ``transforms.json``; None: frames that the run held out
     *,
-    poses: PosesFrom = "reference",
-    align: Path | None = None,
+    poses: PosesFrom = "reference",  # or those of the run, of the frames of the same stems
+    align: Path | None = None,  # cameras that align the worlds; None: ``observed`` next to, or ``directory``
     reporter: Reporter,
 ) -> Reference:
     """Return the reference for the scenes of a run, or for a scene in the world of ``directory``.
 
-    If the run's poses are from SfM, or were refined, the worlds are aligned by cameras of equal stems.
-
-    Args:
-        run: the run; None: a scene in the world of ``directory``.
-        directory: folder with ``images/`` and ``transforms.json`` in the world of the run's input. None: the
-            frames that the run held out.
-        poses: render at the reference's poses, or at the run's own poses of the frames of the same stems.
-        align: folder of the cameras that align the worlds; None: ``observed`` next to ``directory`` if
-            there is one, or else ``directory``.
-        reporter: shows remarks.
-
-    Raises:
-        InputError: files are missing or damaged, stems do not match, worlds do not align, or nothing was held
-            out.
+    If the run's poses are from SfM, or were refined, the worlds are aligned by cameras of equal stems. Raises
+    InputError if files are missing or damaged, stems do not match, worlds do not align, or nothing was held
+    out.
     """
     if run is None:
         if directory is None:

@@ -87,25 +87,13 @@ class CaptureFormation:
         views: Sequence[TrainingView],
         config: FormationConfig,
         *,
-        exposure: Exposure | None = None,
-        lr_exposure: float = 0.0,
-        known: Mapping[int, FrameFormation] | None = None,
-        moving: Mapping[int, MaskBool] | None = None,
-        tolerance: float = 0.0,
-        draft: bool = False,
+        exposure: Exposure | None = None,  # colour affines to begin with; None: a training without any
+        lr_exposure: float = 0.0,  # learning rate of the affines
+        known: Mapping[int, FrameFormation] | None = None,  # from an earlier training, by frame_id
+        moving: Mapping[int, MaskBool] | None = None,  # cells that move, likewise
+        tolerance: float = 0.0,  # difference of mean colours from which a cell can move; 0: none is added
+        draft: bool = False,  # search frames only where the test finds blur, also at the first look
     ) -> None:
-        """Begin with what is known of the frames.
-
-        Args:
-            views: Views of the training.
-            config: Settings.
-            exposure: Colour affines to begin with; None for a training without any.
-            lr_exposure: Learning rate of the affines.
-            known: Formations from an earlier training, by frame_id.
-            moving: Cells that move, likewise.
-            tolerance: Difference of mean colours from which a cell can move; 0: nothing more is looked for.
-            draft: Search frames only where the test finds blur, also at the first look.
-        """
         weighted = [view for view in views if view.weight > 0.0]
         self._config, self._draft = config, draft
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)

@@ -66,22 +66,14 @@ _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus
 def search(
     pair: FramePair,
     *,
-    start: FrameMotion | None = None,
-    skew: bool = True,
-    defocus: bool = True,
-    pose: bool = False,
+    start: FrameMotion | None = None,  # has the blur to begin with; None: the best of a grid of blurs
+    skew: bool = True,  # try models with a rolling shutter, which doubles the time
+    defocus: bool = True,  # try a disc of defocus, which doubles the time
+    pose: bool = False,  # correct the pose together with each motion
 ) -> list[MotionFit]:
     """Fit every model from scratch.
 
-    Args:
-        pair: The frame and the render.
-        start: A motion whose blur the descent begins with; None for the best of a grid of blurs.
-        skew: Try models with a rolling shutter, which doubles the time.
-        defocus: Try a disc of defocus, which doubles the time.
-        pose: Correct the pose together with each motion.
-
-    Returns:
-        The fit of ``none`` first, then one of each model, those with a blur by the order of the path.
+    Return the fit of ``none`` first, then one of each model, those with a blur by the order of the path.
     """
     levels = [Level(pair, scale) for scale in scales(pair)]
     coarse = levels[0]
@@ -117,10 +109,8 @@ def refine(
 ) -> list[MotionFit]:
     """Fit ``model`` again from the numbers of the last fit, at the finest level.
 
-    The pose is corrected with ``pose``, and the next order of the path is tried with ``curve``.
-
-    Returns:
-        The fit of ``none`` first, then that of ``model`` where it is another, then that of the next order.
+    The pose is corrected with ``pose``, and the next order of the path is tried with ``curve``. Return the
+    fit of ``none`` first, then that of ``model`` where it is another, then that of the next order.
     """
     level = finest_level(pair)
     if model == "none":

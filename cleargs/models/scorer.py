@@ -45,12 +45,9 @@ class Scorer(Network, Protocol):
     """A model that rates the quality of single images."""
 
     def score(self, image: ImageF32, *, threads: int = 1) -> float:
-        """Return the score of an image, 0-100, higher is better.
+        """Return the score of an image [H, W, 3] sRGB in [0, 1]: 0-100, higher is better.
 
-        Args:
-            image: [H, W, 3] float32 sRGB in [0, 1], each side at least 32 pixels. InputError is raised for
-                others.
-            threads: Number of CPU threads; it does not change any bit of the score.
+        Raises InputError if a side has less than 32 pixels. ``threads`` change no bit of the score.
         """
 
 

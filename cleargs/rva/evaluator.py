@@ -59,16 +59,11 @@ class Evaluator(Protocol):
         """Number that is raised if a change gives other cues for the same images."""
 
     def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
-        """Estimate the cues of frames.
+        """Return the cues [n, 11] in [0, 1] of frames, columns as `tables.CUE_COLUMNS`; NaN where unscored.
 
-        Args:
-            views: Frames in trajectory order. Their images are read one by one, so that memory does not grow
-                with their number.
-            threads: Number of threads. The result does not depend on it.
-            reporter: Receives the progress, and a warning for each frame that could not be scored.
-
-        Returns:
-            Cues [n, 11] in [0, 1], columns as `tables.CUE_COLUMNS`; NaN for unscored frames.
+        Frames are in trajectory order. Their images are read one by one, so that memory does not grow with
+        their number. The result does not depend on ``threads``. ``reporter`` receives the progress, and a
+        warning for each frame that could not be scored.
         """
 
 
