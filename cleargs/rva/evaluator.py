@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -99,14 +98,19 @@ class ItemCache:
                 f"cannot read {error.filename}: {error.strerror or error}", hint="check that the file exists"
             ) from error
         digest = hashlib.sha256(json.dumps([*self.facts, *parts]).encode()).hexdigest()
-        file = self.folder / f"{digest}.json"
-        with suppress(OSError, ValueError, KeyError, TypeError):  # it is missing or damaged
+        row = self.find(self.folder / f"{digest}.json")
+        if row is None:
+            row = make(view)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(self.folder / f"{digest}.json", dict(zip(self.columns, row.tolist(), strict=True)))
+        return row
+
+    def find(self, file: Path) -> ArrayF64 | None:
+        """Return the row in ``file``, or None if the file is missing or damaged."""
+        try:
             kept = read_json(file)
             row = np.array([kept[column] for column in self.columns], dtype=np.float64)
-            low, high = self.bounds
-            if (np.isfinite(row) & (row >= low) & (row <= high)).all():
-                return row
-        row = make(view)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_json(file, dict(zip(self.columns, row.tolist(), strict=True)))
-        return row
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        low, high = self.bounds
+        return row if bool((np.isfinite(row) & (row >= low) & (row <= high)).all()) else None
