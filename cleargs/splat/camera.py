@@ -56,12 +56,6 @@ class Camera:
         centre: npt.NDArray[np.float64] = -rotation.T @ translation
         return centre
 
-    def shows_as(self, other: Camera) -> bool:
-        """Return True if the other camera has the same pose, lens and size."""
-        *lens, pose = vars(self).values()
-        *other_lens, other_pose = vars(other).values()
-        return lens == other_lens and np.array_equal(pose, other_pose)
-
     def resized(self, width: int, height: int) -> Camera:
         """Return this camera for images resampled to ``width`` x ``height`` pixels."""
         x, y = width / self.width, height / self.height

@@ -35,6 +35,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.interruption import deferred_sigterm
 from cleargs.splat.kernels.cpu.jit import compiled_mark
 from cleargs.splat.kernels.cuda import support
+from cleargs.splat.kernels.rasteriser import view_numbers
 from cleargs.splat.scene import Colour, Scene
 from cleargs.splat.schedule import Schedule, random_grey
 from cleargs.splat.state import load_state, save_state
@@ -386,12 +387,13 @@ class _Looks:
 
     def __init__(self, render: Callable[..., Render], colour: Colour | None, background: Colour) -> None:
         self._render, self._colour, self._background = render, colour, background
-        self._last: tuple[Camera, Render] | None = None
+        self._last: Render | None = None
+        self._seen_by: list[float] = []
 
     def render(self, camera: Camera) -> Render:
         """Return a render with depth over the background of the scene."""
         render = self._render(camera, background=self._colour)
-        self._last = camera, render
+        self._last, self._seen_by = render, _numbers(camera)
         if self._colour is None:
             return render
         change = torch.tensor(self._background) - torch.tensor(self._colour)
@@ -400,7 +402,11 @@ class _Looks:
 
     def last_of(self, camera: Camera) -> Render | None:
         """Return the last render if it is of ``camera``, over the colour of the step."""
-        return self._last[1] if self._last is not None and self._last[0].shows_as(camera) else None
+        return self._last if self._last is not None and self._seen_by == _numbers(camera) else None
+
+
+def _numbers(camera: Camera) -> list[float]:
+    return [camera.width, camera.height, *view_numbers(camera)]
 
 
 def _next_save(begun: float, ended: float) -> float:
