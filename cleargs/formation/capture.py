@@ -175,7 +175,7 @@ class CaptureFormation:
                 rolling=self._rolls(),
                 again=_searched_again(frame.draws // self._config.every),
                 test_rolling=self._asks(frame_id),
-                draft=self._draft or self._sharp(),
+                sparing=self._draft or self._sharp(),
             )
 
         begun = progress >= self._config.start

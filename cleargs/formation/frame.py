@@ -35,7 +35,7 @@ EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
 """Share of the squared error on unseen tiles that further blur must explain before a frame is searched; the
 second holds for frames that RVA doubts. Both are from tuning captures (docs/experiments/formation.md)."""
 WORSE = -0.03
-"""Share of the misfit that half of the tested blur must explain before a frame without a model is searched.
+"""Share of the misfit that half of the tested blur must explain before a frame of a sharp capture is searched.
 Wrong geometry can pass for a blur in the test, but a blur makes the render less like such a frame.
 Source: docs/experiments/formation.md."""
 GROWN_EVIDENCE = 1.25
@@ -108,7 +108,7 @@ def fit_motion(
     rolling: bool = False,  # admit models with a skew
     test_rolling: bool = False,  # measure `skew_gain` even where no such model is admitted
     again: bool = False,  # try a higher order, and search a frame with a curved path or a rolling shutter
-    draft: bool = False,  # search the first time, too, only if the test finds blur
+    sparing: bool = False,  # search, the first time too, only if the test finds blur that resembles the frame
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
@@ -128,14 +128,14 @@ def fit_motion(
     best = _accepted(followed, found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
     skews = rolling or test_rolling
-    first = frame.draws == 0 and not draft  # a scene that is still soft hides short blurs from the test
+    first = frame.draws == 0 and not sparing  # a scene that is still soft hides short blurs from the test
     # A descent with many unknowns that began in a soft scene can end in a wrong path and stay there.
     again = again and (rolling or followed.motion.order > 1)
     asked = first or untested or test_rolling or again or not _admitted(frame.model, rolling)
     enough = max(DOUBTED_EVIDENCE if doubted else EVIDENCE, GROWN_EVIDENCE * frame.evidence)
     left = min(frame.evidence, evidence.gain)
     blurred = evidence.gain > enough and best.misfit > MIN_MISFIT
-    if asked or (blurred and (best.model != "none" or _resembled(pair, evidence))):
+    if asked or (blurred and (best.model != "none" or not sparing or _resembled(pair, evidence))):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
         if wide > margin:
             margin, rendered = wide, render(widened(camera, wide))

@@ -280,7 +280,7 @@ def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
         noisy = view.load()[0] + rng.normal(0.0, 8.0, (HEIGHT, WIDTH, 3))
         pixels = np.clip(noisy, 0, 255).astype(np.uint8)
         seen.append(replace(view, load=lambda pixels=pixels: (pixels, None)))
-    formation = CaptureFormation(seen, LOOK, known=known())
+    formation = CaptureFormation(seen, LOOK, known=known(), draft=True)
     run(tmp_path, seen, formation)
     assert formation.frames[0].misfit > MIN_MISFIT
     assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
