@@ -35,8 +35,8 @@ EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
 """Share of the squared error on unseen tiles that further blur must explain before a frame is searched; the
 second holds for frames that RVA doubts. Both are from tuning captures (docs/experiments/formation.md)."""
 WORSE = -0.03
-"""Share of the misfit that half of the tested blur must explain before a frame of a sharp capture is searched.
-Wrong geometry can pass for a blur in the test, but a blur makes the render less like such a frame.
+"""Share of the misfit that half of the tested blur must explain before a frame of a sharp capture is
+searched. Wrong geometry can pass for a blur in the test, but a blur makes the render less like such a frame.
 Source: docs/experiments/formation.md."""
 GROWN_EVIDENCE = 1.25
 """Factor by which that share must have grown since the last search before a frame is searched again."""
