@@ -108,7 +108,7 @@ def fit_motion(
     rolling: bool = False,  # admit models with a skew
     test_rolling: bool = False,  # measure `skew_gain` even where no such model is admitted
     again: bool = False,  # try a higher order, and search a frame with a curved path or a rolling shutter
-    sparing: bool = False,  # search, the first time too, only if the test finds blur that resembles the frame
+    sparing: bool = False,  # the first time, too, search only for a blur of the test that `_resembled` admits
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 

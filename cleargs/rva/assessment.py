@@ -84,6 +84,7 @@ def assess(
     r, b = R[rows], B[rows]
 
     reliable = allocation.is_reliable(r, b, config)
+    # Without a reliable frame, the best by R - B replace them in the geometry.
     stand_ins = 0 if reliable.any() else max(1, round(config.stand_in_share * len(r)))
     stand_in = allocation.best_frames(r, b, stand_ins)
     reference = reliable | stand_in
