@@ -10,6 +10,7 @@ one is killed.
 
 from __future__ import annotations
 
+import math
 import os
 import sqlite3
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import copy_database, is_sound, remove_database
 
 _PAIRS_PER_BLOCK = 200
-"""COLMAP indexes the features of a frame again in each block (a tenth of the time),
+"""Most pairs of a block. COLMAP indexes the features of a frame again in each block (a tenth of the time),
 and keeps no matches of an unfinished block."""
 
 N_WORDS = 32
@@ -98,6 +99,12 @@ def _vlad(rows: NDArray[np.uint8], words: NDArray[np.float64]) -> NDArray[np.flo
     return (rooted / norm if norm > 0 else rooted).ravel()
 
 
+def block_size(pairs: int, processes: int) -> int:
+    """Return the number of pairs per block, so that all ``processes`` get equally many blocks."""
+    rounds = max(1, math.ceil(pairs / (processes * _PAIRS_PER_BLOCK)))
+    return max(1, math.ceil(pairs / (processes * rounds)))
+
+
 def match_pairs(
     database: Path,
     names: Sequence[str],
@@ -123,8 +130,8 @@ def match_pairs(
         todo = [pair for pair in pairs if not opened.exists_matches(pair[0] + 1, pair[1] + 1)]
     through = len(pairs) - len(todo)
     done(through)
-    size = min(_PAIRS_PER_BLOCK, max(1, -(-len(todo) // processes)))
     lines = [f"{names[i]} {names[j]}\n" for i, j in todo]
+    size = block_size(len(todo), processes)
     blocks = [lines[start : start + size] for start in range(0, len(lines), size)]
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         for count in pool.map(partial(_match_block, database, seed), blocks):

@@ -15,7 +15,7 @@ import pycolmap
 import pytest
 
 from cleargs.capture import matching
-from cleargs.capture.matching import match_pairs
+from cleargs.capture.matching import block_size, match_pairs
 
 NAMES = [f"view{index}.png" for index in range(4)]
 PAIRS = list(combinations(range(len(NAMES)), 2))
@@ -53,6 +53,20 @@ def test_any_number_of_processes_finds_the_same(database: Path, tmp_path: Path) 
     assert match(copy, 4) == [0, 2, 4, 6]
     assert len(matches(database)) == 12 and matches(database) == matches(copy)
     assert sorted(path.name for path in tmp_path.glob("*share*")) == []
+
+
+@pytest.mark.parametrize(
+    ("pairs", "processes", "size"),
+    [
+        (1290, 2, 162),  # four blocks each; blocks of 200 would be four and three
+        (1700, 8, 107),  # two blocks each; blocks of 200 would leave seven processes without a second one
+        (400, 2, 200),
+        (3, 8, 1),
+        (0, 2, 1),
+    ],
+)
+def test_processes_get_equally_many_blocks(pairs: int, processes: int, size: int) -> None:
+    assert block_size(pairs, processes) == size
 
 
 def test_matches_of_a_killed_run_are_gathered(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
