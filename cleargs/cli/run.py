@@ -175,16 +175,15 @@ def run(
             reporter.warn(line)
         with opened_store(settings.store) as opened:
             check_same_input(settings, dag, opened)
+            runner = Runner(dag, settings, opened, threads, reporter)
             if dry_run:
-                planner = Planner(dag, settings, opened, threads, reporter)
-                print_plans(planner.plan(until, tuple(dag.check(name) for name in force)), as_json)
+                print_plans(runner.plan(until, tuple(dag.check(name) for name in force)), as_json)
                 return 0
             log(
                 f"cleargs {cleargs.__version__}, {settings.device}, {threads} threads, store {settings.store}"
             )
-            runner = Runner(dag, settings, opened, threads, reporter)
             outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
-            page = write_run_report(runner.planner, outcomes) if wants_report else None
+            page = write_run_report(runner, outcomes) if wants_report else None
             if not wants_report and (line := outdated_report_note(settings.folder, dag)):
                 reporter.info(line)
         for outcome in outcomes:

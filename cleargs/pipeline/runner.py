@@ -41,7 +41,6 @@ from cleargs.pipeline.plan import (
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, read_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
-from cleargs.progress import Reporter
 
 
 @dataclass(frozen=True)
@@ -54,15 +53,8 @@ class StageOutcome:
     folder: Path
 
 
-class Runner:
-    """Runs the stages of one run. Public methods hold ``store.in_use()`` while they work."""
-
-    def __init__(self, dag: Dag, run: RunSpec, store: Store, threads: int, reporter: Reporter) -> None:
-        self.dag = dag
-        self.run = run
-        self.store = store
-        self.reporter = reporter
-        self.planner = Planner(dag, run, store, threads, reporter)
+class Runner(Planner):
+    """Plans the stages of one run, and runs them. `run_until` holds ``store.in_use()`` while it works."""
 
     def run_until(
         self, until: str | None = None, *, force: Sequence[str] = (), allow_partial: bool = False
@@ -78,12 +70,12 @@ class Runner:
         """
         check_address_space()
         forced = tuple(self.dag.check(name) for name in force)
-        plans = self.planner.plan(until, forced)
+        plans = self.plan(until, forced)
         for plan in plans:
             if plan.state != "done":
                 self.dag.load(plan.stage).preflight(self.run.config.effective[plan.stage])
         check_disk(plans, self.store.root)
-        plans = self.planner.at_measured_pace(plans)
+        plans = self.at_measured_pace(plans)
         for line in (*rerun_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)
@@ -109,7 +101,7 @@ class Runner:
 
     def _unlink_outdated(self) -> None:
         """Remove the links to results of other settings or inputs."""
-        for name in self.planner.outdated():
+        for name in self.outdated():
             self.store.unlink(self.run.folder, name)
         self._link_scene()
 
@@ -126,7 +118,7 @@ class Runner:
     def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
         """Report the cost of the remaining stages again: it is better known once the capture is read."""
         costs = [
-            replace(plan, estimate=self.planner.estimate(plan.stage, done))
+            replace(plan, estimate=self.estimate(plan.stage, done))
             for plan in plans
             if plan.estimate is not None
         ]
@@ -160,20 +152,20 @@ class Runner:
             f"{name}: the GPU failed ({fault}); {', '.join(stages)} run on the CPU, {name} from its start. "
             "Finished stages are kept. Try the GPU again with --device cuda"
         )
-        self.run = self.planner.run = replace(self.run, on_cpu=stages)
+        self.run = replace(self.run, on_cpu=stages)
         write_run_file(self.run)
 
     def _find_or_make_on_device(
         self, name: str, done: Mapping[str, Manifest], *, forced: bool
     ) -> StageOutcome:
-        stage_key = self.planner.stage_key(name, done)
+        stage_key = self.stage_key(name, done)
         entry = self.store.find(name, stage_key.parts.key)
         manifest = entry.complete if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
             stage_key = self._rehashed_key(name, done)
             entry = self.store.find(name, stage_key.parts.key)
-            reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
+            reasons = ("forced",) if forced else self.reasons(stage_key, entry)
             with self.store.lock(stage_key.parts.key, self.reporter, name) as locked:
                 entry = self.store.find(name, stage_key.parts.key)
                 if entry is not None and entry.damage is not None:
@@ -206,7 +198,7 @@ class Runner:
                     f"{upstream}: the stored results are damaged ({damaged})",
                     hint="give the same command again; it replaces them",
                 )
-        return self.planner.stage_key(name, done, rehash=True)
+        return self.stage_key(name, done, rehash=True)
 
     def _make(self, stage_key: StageKey, entry: Entry | None, *, forced: bool, locked: bool) -> Manifest:
         """Run the stage and publish its results. The caller holds the lock of the key."""
@@ -215,7 +207,7 @@ class Runner:
         work = self.store.open_work(
             stage_key.parts.key, forced=forced, entry=entry, leftovers=stage.LEFTOVERS, locked=locked
         )
-        context = self.planner.context(name, stage_key.inputs, work)
+        context = self.context(name, stage_key.inputs, work)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
         try:
@@ -231,7 +223,7 @@ class Runner:
             "cpu_seconds": round(usage.cpu_seconds, 3),
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
         }
-        now = self.planner.external_digests(name)
+        now = self.external_digests(name)
         if now != {role: stage_key.origins[role] for role in now}:
             self.store.discard(work.folder)
             raise StageError(

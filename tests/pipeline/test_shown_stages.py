@@ -11,8 +11,8 @@ from toy import Bench
 
 from cleargs.digest import DigestMemo
 from cleargs.manifest import read_manifest
+from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
-from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 
 
@@ -24,8 +24,8 @@ def reasons(bench: Bench) -> dict[str, tuple[str, ...]]:
     """Return the reasons that `cleargs status` gives for each stage that is not done."""
     run = read_run_file(bench.folder, bench.dag)
     with DigestMemo(run.store / "digests.sqlite") as memo:
-        planner = Runner(bench.dag, run, Store(run.store, memo), 1, bench.remarks).planner
-        return {plan.stage: plan.reasons for plan in planner.plan() if plan.state != "done"}
+        plans = Planner(bench.dag, run, Store(run.store, memo), 1, bench.remarks).plan()
+        return {plan.stage: plan.reasons for plan in plans if plan.state != "done"}
 
 
 def test_changed_setting_hides_what_it_affects(bench: Bench) -> None:
