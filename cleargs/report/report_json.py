@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import cleargs
 from cleargs.files import write_json
 from cleargs.manifest import Manifest, linked_manifest
-from cleargs.safe_io import read_json
+from cleargs.safe_io import FAULTS, read_json
 
 FOLDER, PAGE, REPORT_JSON = "report", "index.html", "report.json"
 ENTRY = "report.html"
@@ -29,19 +30,14 @@ def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
 
 def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
     """Return True if the report of ``run`` shows the results of ``manifests`` and has this version."""
-    return (run / FOLDER / PAGE).is_file() and _read_report(run).get("made_from") == _made_from(manifests)
+    with suppress(*FAULTS):
+        made_from = read_json(run / FOLDER / REPORT_JSON)["made_from"]
+        return page_of(run).is_file() and _made_from(manifests) == made_from
+    return False
 
 
 def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
     return {"cleargs": cleargs.__version__, **{name: manifest.key for name, manifest in manifests.items()}}
-
-
-def _read_report(run: Path) -> dict[str, Any]:
-    try:
-        content = read_json(run / FOLDER / REPORT_JSON)
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def write_report_json(folder: Path, manifests: Mapping[str, Manifest]) -> None:
