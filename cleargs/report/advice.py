@@ -57,7 +57,15 @@ def shown_advice(
     planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
 ) -> list[Advice]:
     """Return all advice on a run, the most useful first. Holding out frames is never the only command."""
-    found = sorted(_advice(planner, manifests, rows), key=lambda advice: -advice.worth)
+    found = [
+        Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
+        for manifest in manifests.values()
+        for missing in manifest.missing
+    ]
+    found += _on_frames(planner.run.config, manifests, rows)
+    if "g0" in manifests:
+        found += _on_training(planner, manifests, rows)
+    found.sort(key=lambda advice: -advice.worth)
     if not any(advice.options and advice.worth for advice in found):
         found = [advice for advice in found if advice.worth]
     return [
@@ -126,18 +134,6 @@ def _time(planner: Planner, options: Sequence[str]) -> str:
     except CleargsError:  # the capture was deleted or moved
         return ""
     return f"about {max(1, round(sum(costs)))} min" if costs else ""
-
-
-def _advice(
-    planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
-) -> Iterator[Advice]:
-    """Yield all advice on a run, in the order of the stages."""
-    for manifest in manifests.values():
-        for missing in manifest.missing:
-            yield Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
-    yield from _on_frames(planner.run.config, manifests, rows)
-    if "g0" in manifests:
-        yield from _on_training(planner, manifests, rows)
 
 
 def _on_frames(
