@@ -35,9 +35,9 @@ from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
 from cleargs.files import whole_folder
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
-from cleargs.report.page import page_environment, write_page
+from cleargs.report.page import page_environment, page_html
 from cleargs.report.pictures import ImageFile, side_of, write_jpeg
-from cleargs.report.report_json import page_of
+from cleargs.report.report_json import PAGE, page_of
 
 MAX_POSES = 3
 """Maximum number of poses per capture and set of views; they are spaced evenly."""
@@ -106,8 +106,7 @@ def write_comparison(
     samples = {(cell.column, cell.sample) for cell in cells.cells}
     with whole_folder(page_of(out).parent, replace=True) as folder:
         captures = _captures(out, folder, compared, layers)
-        write_page(
-            folder,
+        html = page_html(
             _environment().get_template("compare.html.jinja"),
             name=out.name,
             aspect=None,
@@ -130,6 +129,7 @@ def write_comparison(
             made_with=made_with,
             data=_data(captures, layers, labels, subject),
         )
+        (folder / PAGE).write_bytes(html)
     return page_of(out)
 
 

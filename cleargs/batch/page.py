@@ -18,9 +18,9 @@ from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
 from cleargs.report.formatting import count, duration
-from cleargs.report.page import write_page
+from cleargs.report.page import page_html
 from cleargs.report.pictures import ImageFile, side_of, write_jpeg
-from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
+from cleargs.report.report_json import FOLDER, PAGE, is_current, linked_manifests, page_of
 
 BYTES = 15_000_000
 """Approximate limit for the size of all thumbnails together."""
@@ -40,8 +40,7 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
     side = min(MAX_SIDE, side_of(len(results), ASPECT, BYTES, MIN_SIDE))
     with whole_folder(batch.folder / FOLDER, replace=True) as report:
         (report / "scenes").mkdir()
-        write_page(
-            report,
+        html = page_html(
             "batch.html.jinja",
             name=batch.folder.name,
             aspect=None,
@@ -54,6 +53,7 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
             stages=batch.dag.until(batch.until),
             cards=[_card(batch, scene, result, report, side) for scene, result in pairs],
         )
+        (report / PAGE).write_bytes(html)
     return page_of(batch.folder)
 
 

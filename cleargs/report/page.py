@@ -50,10 +50,9 @@ from cleargs.splat.tables import TRAIN
 _STILL = 960  # long side of the image that is shown until the 3D viewer has loaded, px
 
 
-def write_page(folder: Path, template: str | Template, **values: Any) -> None:
-    """Write ``index.html`` from a template, or the name of one of the report's. The values are escaped."""
-    html = page_environment().get_template(template).render(version=cleargs.__version__, **values)
-    (folder / PAGE).write_bytes(html.encode())
+def page_html(template: str | Template, **values: Any) -> bytes:
+    """Render a template, given itself or as the name of one of the report's. The values are escaped."""
+    return page_environment().get_template(template).render(version=cleargs.__version__, **values).encode()
 
 
 def json_in_html(value: Any) -> Markup:
@@ -114,8 +113,7 @@ def write_report(planner: Planner) -> Path:
             for number, row in zip(pictures, rows, strict=True)
         ]
         unseen = [found.psnr for found in pictures.values() if found.psnr is not None]
-        write_page(
-            folder,
+        html = page_html(
             "report.html.jinja",
             name=run.name,
             source=planner.run.source.name,
@@ -146,11 +144,9 @@ def write_report(planner: Planner) -> Path:
                 "training": training_curves(run, trained),
             },
         )
+        (folder / PAGE).write_bytes(html)
         write_report_json(folder, manifests)
-    leads_to_it = (
-        page_environment().get_template("entry.html.jinja").render(name=run.name, program=program(run.parent))
-    )
-    write_bytes(run / ENTRY, leads_to_it.encode())
+    write_bytes(run / ENTRY, page_html("entry.html.jinja", name=run.name, program=program(run.parent)))
     return page_of(run)
 
 
