@@ -132,25 +132,21 @@ def completed(names: Callable[[], Iterable[str]]) -> Callable[..., list[str]]:
     return lambda context, parameter, begin: [name for name in names() if name.startswith(begin)]
 
 
-def stage_names() -> tuple[str, ...]:
-    """Return the names of the installed stages."""
-    return installed().names
-
-
 def setting_names() -> list[str]:
     """Return all settings, each with the ``=`` that follows in ``--set``."""
     dag = installed()
     return [f"{one.name}=" for name in dag.names for one in settings_of(name, dag.load(name).CONFIG)]
 
 
+complete_stage = completed(lambda: installed().names)
 scene_option = click.option(
     "--stage",
     "chosen",
-    shell_complete=completed(stage_names),
+    shell_complete=complete_stage,
     help="Stage whose scene to use.  [default: the last finished one]",
 )
 until_option = click.option(
-    "--until", metavar="STAGE", shell_complete=completed(stage_names), help="The last stage to run."
+    "--until", metavar="STAGE", shell_complete=complete_stage, help="The last stage to run."
 )
 recipe_option = click.option(
     "--recipe",

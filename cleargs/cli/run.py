@@ -15,7 +15,7 @@ from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
     DONE_IN_PART,
     answer,
-    completed,
+    complete_stage,
     json_option,
     kept_log,
     manifest_json,
@@ -29,7 +29,6 @@ from cleargs.cli.common import (
     report_option,
     run_argument,
     set_option,
-    stage_names,
     store_option,
     until_option,
     verbose_option,
@@ -102,7 +101,7 @@ Files in RUN:
     "--force",
     multiple=True,
     metavar="STAGE",
-    shell_complete=completed(stage_names),
+    shell_complete=complete_stage,
     help="Run this stage even if its results exist.",
 )
 @report_option("Write RUN/report.html at the end, which opens the report.")
@@ -230,7 +229,7 @@ _RUN = run  # the command, whose name is an argument below
 
 
 @click.command()
-@click.argument("name", shell_complete=completed(stage_names))
+@click.argument("name", shell_complete=complete_stage)
 @run_argument
 @click.option("--force", is_flag=True, help="Run the stage even if its results exist.")
 @report_option("Write the report at the end.")

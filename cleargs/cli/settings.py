@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 import click
 
-from cleargs.cli.common import completed, json_option, print_json, stage_names
+from cleargs.cli.common import complete_stage, json_option, print_json
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import settings_of
 
@@ -19,7 +19,7 @@ Examples:
   cleargs run photos/ -o room --set g0.steps=4000 --set ingest.holdout=every:8
 """
 )
-@click.argument("stage", required=False, shell_complete=completed(stage_names))
+@click.argument("stage", required=False, shell_complete=complete_stage)
 @json_option
 @click.pass_obj
 def settings(dag: Dag, stage: str | None, as_json: bool) -> None:

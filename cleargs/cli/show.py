@@ -16,12 +16,11 @@ from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
     FILE,
     answer,
-    completed,
+    complete_stage,
     json_option,
     manifest_json,
     print_json,
     run_argument,
-    stage_names,
 )
 from cleargs.cli.frame_rows import frame_rows, reason, short_name
 from cleargs.errors import InputError
@@ -76,7 +75,7 @@ Examples:
 """
 )
 @run_argument
-@click.argument("stage", required=False, shell_complete=completed(stage_names))
+@click.argument("stage", required=False, shell_complete=complete_stage)
 @click.option("--columns", is_flag=True, help="List the columns of the tables, with their meanings.")
 @click.option(
     "--frame",
