@@ -40,7 +40,7 @@ from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.errors import StageError
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_of
+from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_text
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
@@ -367,7 +367,8 @@ def print_plans(plans: list[StagePlan], as_json: bool) -> None:
     lines, facts = [], []
     for plan in plans:
         first, *others = plan.reasons or ("",)
-        lines.append(f"{plan.stage:<12} {plan.state:<8} {cost_of(plan):<37} {first}".rstrip())
+        cost = cost_text(plan.estimate) if plan.estimate is not None else ""
+        lines.append(f"{plan.stage:<12} {plan.state:<8} {cost:<37} {first}".rstrip())
         lines += [f"{'':<59} {reason}" for reason in others]
         figures = ("minutes", "memory_gb", "disk_gb")
         estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}

@@ -302,15 +302,10 @@ def cost_line(plans: list[StagePlan]) -> str:
         sum(cost.disk_gb for _, cost in costs),
     )
     stages = ", ".join(f"{stage} {_time(cost.minutes)}" for stage, cost in costs)
-    return f"estimate: about {_cost(whole)} ({stages})"
+    return f"estimate: about {cost_text(whole)} ({stages})"
 
 
-def cost_of(plan: StagePlan) -> str:
-    """Return the expected time, memory and disk of a stage with work to do; "" without any."""
-    return _cost(plan.estimate) if plan.estimate is not None else ""
-
-
-def _cost(cost: Estimate) -> str:
+def cost_text(cost: Estimate) -> str:
     return f"{_time(cost.minutes)}, {cost.memory_gb:.1f} GB memory, {_size(cost.disk_gb)} disk"
 
 
