@@ -205,7 +205,7 @@ class Planner:
             externals=self._externals(name),
             out=work.out,
             checkpoints=work.checkpoints,
-            cache=self.store.cache_folder(name),
+            cache=self.store.root / "kept" / name,
             seed=self.run.config.seed,
             device=self.run.device_of(name),
             threads=self.threads,

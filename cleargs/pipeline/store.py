@@ -240,10 +240,6 @@ class Store:
             folder.rename(rubbish)
         shutil.rmtree(rubbish, ignore_errors=True)
 
-    def cache_folder(self, stage: str) -> Path:
-        """Return the folder for results per item of ``stage`` (`StageContext.cache`)."""
-        return self.root / "kept" / stage
-
     def link(self, run: Path, stage: str, key: str) -> None:
         """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN."""
         target = self.folder(stage, key)

@@ -177,7 +177,7 @@ def test_collect_keeps_what_runs_show(bench: Bench) -> None:
     with DigestMemo(bench.store / "digests.sqlite") as memo:
         store = Store(bench.store, memo)
         (bench.store / "work" / "abc" / "checkpoints").mkdir(parents=True)
-        store.cache_folder("square").mkdir(parents=True)
+        (store.root / "kept" / "square").mkdir(parents=True)
         shown = {(bench.folder / name).resolve() for name in bench.dag.names}
         assert {item.kind for item in store.collect(bench.dag.names, checkpoints=False, dry_run=True)} == {
             "finished"
