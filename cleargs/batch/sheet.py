@@ -46,9 +46,7 @@ class After(FrozenModel):
 class SheetRow(FrozenModel):
     """A scene as it is in the sheet, with the defaults of the sheet filled in."""
 
-    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")] = Field(
-        description=NAMES
-    )
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
     input: Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
     recipe: str = "default"
     set: dict[str, str] = Field({})
