@@ -43,5 +43,4 @@ def demo(
         place.mkdir(parents=True, exist_ok=True)
         make_capture(capture, "mixed", frames=16, width=480, height=270, seed=0, reporter=reporter)
     given = {"recipe": "smoke", "overrides": ("ingest.poses=sfm",), "quality": quality}
-    made = context.invoke(run, source=capture, folder=place / "run", opens=opens, **given, **options)
-    return int(made)
+    return int(context.invoke(run, source=capture, folder=place / "run", opens=opens, **given, **options))
