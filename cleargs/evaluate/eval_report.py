@@ -20,7 +20,6 @@ from cleargs.parquet import column, write_table
 from cleargs.safe_io import read_bytes
 
 PosesFrom = Literal["reference", "given"]
-World = Literal["scene", "ingest", "umeyama"]
 
 _MEANINGS = {
     "psnr": "dB, of the mean squared error of an image; higher is better",
@@ -58,7 +57,7 @@ class Region(Figures):
 class Alignment(Figures):
     """Transformation of the reference's poses into the scene's world."""
 
-    world: World = Field(
+    world: Literal["scene", "ingest", "umeyama"] = Field(
         description="scene: they are in it; ingest: by the similarity of ingest; umeyama: fitted to the "
         "cameras of the frames of the same stem, because the run's poses are not the input's."
     )
