@@ -42,8 +42,7 @@ squared."""
 class Intrinsics:
     """Intrinsics in pixels of an image of ``width`` x ``height``. The centre of the first pixel is 0.5.
 
-    Raises:
-        InputError: an unknown model, or parameters that no lens has.
+    Raises InputError for an unknown model, or parameters that no lens has.
     """
 
     model: str
@@ -162,11 +161,8 @@ def rigid_pose(camera_to_world: NDArray[np.float64], name: str, hint: str) -> Po
     """Return the pose of a camera-to-world matrix with OpenGL axes (x right, y up, z back).
 
     Printed poses are orthonormal to a few digits only, and some writers leave a scale in. The nearest
-    rotation is taken. ``name`` of the frame and ``hint`` are for the error.
-
-    Raises:
-        InputError: NaN, a coordinate above `MAX_COORDINATE`, a mirror image, or axes whose lengths differ by
-            more than 5 %.
+    rotation is taken. ``name`` of the frame and ``hint`` are for the InputError, which is raised for NaN, a
+    coordinate above `MAX_COORDINATE`, a mirror image, or axes whose lengths differ by more than 5 %.
     """
     if not within_reach(camera_to_world):
         raise InputError(f"the pose of {name} is not finite, or out of reach", hint=hint)

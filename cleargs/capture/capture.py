@@ -75,8 +75,5 @@ class Layout(Protocol):
     def open_capture(self, source: Path, config: CaptureConfig) -> Capture:
         """Return at most ``config.max_frames`` frames in trajectory order, with known cameras and poses.
 
-        Decodes no frame and changes nothing.
-
-        Raises:
-            InputError: the input is damaged or incomplete.
+        Decodes no frame and changes nothing. Raises InputError if the input is damaged or incomplete.
         """

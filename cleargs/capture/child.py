@@ -50,11 +50,9 @@ def _die_with_parent() -> None:
 def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
     """Run ``python -P -m module job`` to its end, showing its progress.
 
-    If this call ends early (Ctrl-C above all), the child and what it started are killed first.
-
-    Raises:
-        StageError: with the child's cause, or with the last failed check in ``log`` when it aborted.
-        StoreError: the disk is full.
+    If this call ends early (Ctrl-C above all), the child and what it started are killed first. Raises
+    StageError with the child's cause, or with the last failed check in ``log`` when it aborted, and
+    StoreError if the disk is full.
     """
     # Sums in COLMAP's and numpy's linear algebra must not depend on threads.
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

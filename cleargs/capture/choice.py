@@ -85,9 +85,7 @@ def held_out(
     every:N holds out frames 0, N, 2N, ..., as Mip-NeRF 360 and 3DGS do with N = 8. sharpest:N holds out the
     sharpest of every N ``registered`` frames in a row, also of the shorter rest, as 3dgs-deblur's
     ``train_eval_split_by_blur_score.py`` does; ``read`` gives their images. Ties go to the earlier frame.
-
-    Raises:
-        InputError: unknown names, or no registered frame is left for training.
+    Raises InputError for unknown names, or if no registered frame is left for training.
     """
     kind, _, number = rule.partition(":")
     chosen: set[int] = set()

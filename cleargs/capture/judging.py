@@ -49,12 +49,9 @@ def keep_out(database: Path) -> tuple[Matches, float]:
     """Remove every `HELD_OUT`-th track from the verified matches in ``database``.
 
     A track is all features that matches connect. Its matches are kept out together: else the others would
-    give its point away.
-
-    Returns:
-        The matches that were removed, and their median distance, px, from the lines of the fundamental
-        matrices that COLMAP fitted to each pair alone: no poses explain them much better. It is 0 where no
-        pair has one.
+    give its point away. Returns the removed matches, and their median distance, px, from the lines of the
+    fundamental matrices that COLMAP fitted to each pair alone: no poses explain them much better. It is 0
+    where no pair has one.
     """
     kept_out: Matches = {}
     alone = [np.zeros(0)]

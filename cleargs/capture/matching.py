@@ -116,10 +116,7 @@ def match_pairs(
     """Match and verify the ``pairs`` of frame numbers that have no matches in ``database`` yet.
 
     The result is the same for any number of ``processes``. ``done`` receives the number of finished pairs.
-
-    Raises:
-        BrokenProcessPool: a process ended.
-        sqlite3.DatabaseError: the matches of a process cannot be copied back.
+    Raises BrokenProcessPool if a process ended, and sqlite3.DatabaseError if its matches cannot be copied.
     """
     for leftover in _shares(database):
         # One that was damaged when its run was killed is left out: its pairs are matched again.
@@ -164,11 +161,7 @@ def _shares(database: Path) -> list[Path]:
 
 
 def _gather(database: Path, share: Path) -> None:
-    """Copy the matches in ``share`` to ``database``.
-
-    Raises:
-        sqlite3.DatabaseError: one of them is damaged; no match is copied.
-    """
+    """Copy the matches in ``share`` to ``database``, or raise sqlite3.DatabaseError if one is damaged."""
     if not is_sound(share):
         raise sqlite3.DatabaseError(f"{share} is damaged")
     with closing(sqlite3.connect(database)) as opened:

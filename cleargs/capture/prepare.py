@@ -50,11 +50,9 @@ class WorkFrame:
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
     """Write the working images ``folder/images/%06d.png`` and their masks ``folder/masks/%06d.png.png``.
 
-    The names of masks are COLMAP's. Images are reduced to ``long_side`` px, never enlarged. Intact
-    images of a killed run stay.
-
-    Raises:
-        InputError: an unreadable image, an image without the proportions of its camera, or a panorama.
+    The names of masks are COLMAP's. Images are reduced to ``long_side`` px, never enlarged. Intact images of
+    a killed run stay. Raises InputError for an unreadable image, an image without the proportions of its
+    camera, or a panorama.
     """
     images, masks = folder / "images", folder / "masks"
     make_folder(images)

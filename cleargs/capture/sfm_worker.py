@@ -281,10 +281,8 @@ class _Sfm(Features):
     ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
         """Continue mapping with other features, by `AGAIN`, while frames have no pose.
 
-        It works in copies of the database, so that a killed run finds the first one unchanged.
-
-        Returns:
-            The model, and for each image how it was placed or why it was not.
+        It works in copies of the database, so that a killed run finds the first one unchanged. Returns the
+        model, and for each image how it was placed or why it was not.
         """
         names, reach = self._job.names, self._job.config.overlap
         self._matched = self._database

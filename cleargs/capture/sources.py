@@ -34,8 +34,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """Detect the layout of ``source`` and choose its frames. Decodes no frame and changes nothing.
 
-    Raises:
-        InputError: the input does not exist, is damaged, or has too few frames.
+    Raises InputError if the input does not exist, is damaged, or has too few frames.
     """
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, or a folder of images")

@@ -30,10 +30,8 @@ class OnnxExpert:
 
     The network maps an image [1, 3, H, W], float32 sRGB in [0, 1], to an image of the same size. Its first
     output is used. A fixed input size is the size of the tiles. ``name`` is for tables (None: the file name
-    without its extension); ``device`` is a result of `network_device`.
-
-    Raises:
-        InputError: The file is missing, is not an ONNX model, or has other inputs.
+    without its extension); ``device`` is a result of `network_device`. Raises InputError if the file is
+    missing, is not an ONNX model, or has other inputs.
     """
 
     def __init__(self, path: Path, name: str | None = None, device: Device = "cpu") -> None:

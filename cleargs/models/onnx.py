@@ -87,11 +87,8 @@ class OnnxModel:
     """An ONNX file, loaded by onnxruntime. It runs on the CPU if the GPU's provider does not load.
 
     The file must contain all weights, because the digest does not cover other files. ``device`` is a result
-    of `network_device`.
-
-    Raises:
-        InputError: The file is missing, refers to other files, or is not a model that onnxruntime can run.
-        MemoryError: The model does not fit into memory.
+    of `network_device`. Raises InputError if the file is missing, refers to other files, or is not a model
+    that onnxruntime can run, and MemoryError if the model does not fit into memory.
     """
 
     def __init__(self, path: Path, device: Device = "cpu") -> None:
@@ -141,9 +138,7 @@ class OnnxModel:
     def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
         """Return all outputs for the given inputs, both in the model's order. The method is thread-safe.
 
-        Raises:
-            MemoryError: The computation does not fit into memory.
-            StageError: onnxruntime failed for another reason.
+        Raises MemoryError if the memory is too small, and StageError if onnxruntime fails otherwise.
         """
         feeds = {info.name: tensor for info, tensor in zip(self._inputs, tensors, strict=True)}
         try:

@@ -97,10 +97,8 @@ class LearnedScorer:
 
     ``name`` and ``device`` are those of an `OnnxExpert`. ``tile`` is the side of tiles whose mean is the
     score, px, so that the score depends little on the size of the image. None: the whole image, or tiles of
-    the network's fixed input size.
-
-    Raises:
-        InputError: The file is missing, is not an ONNX model, or has other inputs or outputs.
+    the network's fixed input size. Raises InputError if the file is missing, is not an ONNX model, or has
+    other inputs or outputs.
     """
 
     def __init__(
@@ -157,9 +155,7 @@ class MusiqScorer:
 def patches(image: ImageF32) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
     """Cut an image [H, W, 3] into patches as pyiqa: at full size and with longer sides of 224 and 384 px.
 
-    Returns:
-        Patches [N, 3, 32, 32] in [-1, 1], their cells in the position grid [N], and the indices of their
-        sizes [N].
+    Returns them [N, 3, 32, 32] in [-1, 1], their cells in the position grid [N], and indices of sizes [N].
     """
     import torch  # here, because it takes seconds and names of scorers must be available fast
     from torch.nn.functional import interpolate

@@ -62,11 +62,8 @@ class Runner(Planner):
         """Find or make the results of each stage up to ``until``, and link them into the run folder.
 
         Stages in ``force`` run even if their results are in the store. The run stops after a stage that is
-        done only in part, unless ``allow_partial``; the last outcome lists what is missing.
-
-        Raises:
-            InputError: A model that a stage needs is missing. Nothing was started.
-            CleargsError: A stage failed. The stages before it are finished.
+        done only in part, unless ``allow_partial``; the last outcome lists what is missing. Raises InputError
+        before the first stage if a model is missing, and CleargsError if a stage fails; those before it stay.
         """
         check_address_space()
         forced = tuple(self.dag.check(name) for name in force)

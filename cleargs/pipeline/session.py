@@ -110,11 +110,8 @@ def resolve_run(
 
     An existing run keeps its settings, store and device unless an argument gives others. A ``recipe`` or
     ``reset`` starts from the recipe instead. ``test_gpu`` lets the device "auto" run the self-test of a GPU.
-    ``reporter`` receives messages about the device, and about settings that the run keeps or loses.
-
-    Raises:
-        InputError: ``source`` does not exist or is a run.
-        ConfigError: A setting is unknown or cannot be used.
+    ``reporter`` receives messages about the device, and about settings that the run keeps or loses. Raises
+    InputError if ``source`` does not exist or is a run, and ConfigError if a setting is unknown or unusable.
     """
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")

@@ -48,10 +48,8 @@ def read_llff(root: Path) -> list[SourceFrame]:
 
     Row i belongs to image i by sorted file name (not natural order), as in LLFF. The images are those of the
     first of ``images/`` and ``images_N/`` with as many as there are rows: some releases keep test views in
-    only one folder.
-
-    Raises:
-        InputError: a damaged file, a number of rows that fits no folder, NaN, or cameras that no lens has.
+    only one folder. Raises InputError for a damaged file, a number of rows that fits no folder, NaN, or
+    cameras that no lens has.
     """
     table = read_poses_bounds(root / POSES_BOUNDS)
     folders = {folder.name: sorted(image_files(folder)) for folder in image_folders(root)}

@@ -93,10 +93,8 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
 
     A frame's name is its ``file_path`` as listed, with the extension of the file found. Further entries, such
     as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``, are passed over.
-    ``notes`` receives a note on missing images, which are left out. None: they are an error.
-
-    Raises:
-        InputError: damaged JSON, most images missing, missing or NaN poses, unknown cameras.
+    ``notes`` receives a note on missing images, which are left out. None: they are an error. Raises
+    InputError for damaged JSON, most images missing, missing or NaN poses, and unknown cameras.
     """
     common, entries = _read_listing(path)
     missing = [entry.values["file_path"] for entry in entries if entry.image is None]
