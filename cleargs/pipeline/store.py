@@ -136,11 +136,7 @@ class Store:
 
     @contextmanager
     def lock(self, key: str, reporter: Reporter, stage: str) -> Iterator[bool]:
-        """Hold the lock of ``key``; report another holder and wait for it.
-
-        Yields True with the lock, and False on a file system without locks, where other processes may work
-        on the same key. Raises StoreError if the store is read-only.
-        """
+        """Hold the lock of ``key``, as `exclusive_lock` does. Raises StoreError if the store is read-only."""
         if self._only_readable():
             raise StoreError(
                 f"{stage} has no results yet, and the store {self.root} is read-only",
