@@ -93,7 +93,6 @@ class Batch:
     """True if ``--device auto`` chose the GPU: a scene on which its kernels fail continues on the CPU."""
 
     def run_folder(self, scene: SceneJob) -> Path:
-        """Return the run folder of ``scene``."""
         return self.folder / "scenes" / scene.name
 
     def log(self, scene: SceneJob) -> Path:

@@ -42,7 +42,6 @@ def create_database(database: Path, job: Job) -> None:
 
 
 def set_cameras(database: Path, cameras: Sequence[pycolmap.Camera]) -> None:
-    """Replace the cameras in ``database``."""
     with pycolmap.Database.open(database) as opened:
         for camera in cameras:
             opened.update_camera(camera)

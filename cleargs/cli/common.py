@@ -240,7 +240,6 @@ def manifest_json(manifest: Manifest) -> dict[str, Any]:
 
 
 def print_json(value: Any) -> None:
-    """Print ``value`` as indented JSON on stdout."""
     click.echo(json.dumps(value, indent=2, ensure_ascii=False))
 
 

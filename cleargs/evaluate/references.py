@@ -71,7 +71,6 @@ class ReferenceView:
         return Pose(self.camera.world_to_camera[:3, :3], self.camera.world_to_camera[:3, 3])
 
     def at(self, pose: Pose) -> ReferenceView:
-        """Return the same image at ``pose``."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
         return replace(self, camera=replace(self.camera, world_to_camera=matrix))

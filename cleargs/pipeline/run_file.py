@@ -50,7 +50,6 @@ class RunSpec:
     """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
 
     def device_of(self, stage: str) -> Device:
-        """Return the device of one stage."""
         return "cpu" if stage in self.on_cpu else self.device
 
 

@@ -41,7 +41,6 @@ def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
 
 
 def write_report_json(folder: Path, manifests: Mapping[str, Manifest]) -> None:
-    """Write ``report.json`` into the ``folder`` of a report."""
     content = {"made_from": _made_from(manifests), "cameras": cameras_of(manifests)}
     write_json(folder / REPORT_JSON, content)
 
