@@ -75,13 +75,12 @@ def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> 
 
     ``work`` is the work folder of the stage in the store. The progress file is removed when the block ends.
     """
+    path = run / PROGRESS_FILE
     try:
-        yield RecordingReporter(
-            reporter, run / PROGRESS_FILE, RunningStage(stage=stage, work=work.name, label=stage)
-        )
+        yield RecordingReporter(reporter, path, RunningStage(stage=stage, work=work.name, label=stage))
     finally:
         with suppress(OSError):
-            (run / PROGRESS_FILE).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
 
 class RecordingReporter:
