@@ -114,7 +114,8 @@ def test_tiles_hold_every_touched_pixel_and_few_others(kind):
     assert listed <= 1.02 * needed + 2
 
 
-def test_order_is_by_depth_then_index():
+@pytest.mark.parametrize("chunks", [1, 3])
+def test_order_is_by_depth_then_index(chunks):
     n = 3000
     rng = np.random.default_rng(0)
     splats = np.zeros((n, SPLAT_COLUMNS), np.float32)
@@ -122,7 +123,8 @@ def test_order_is_by_depth_then_index():
     tiles = rng.integers(0, 2, n)
     visible = np.flatnonzero(tiles)
     scratch = [np.empty((2, len(visible)), np.uint32) for _ in range(2)]
-    order = scratch[1][binning.depth_order(splats, tiles, *scratch)]
+    counts = np.empty((chunks, binning.RADIX), np.int64)
+    order = scratch[1][binning.depth_order(splats, tiles, counts, *scratch)]
     expected = visible[np.argsort(splats[visible, 9], kind="stable")]
     np.testing.assert_array_equal(order, expected)
 

@@ -101,42 +101,51 @@ def pair_ranges(tile_counts: AnyArray, pair_offsets: AnyArray) -> int:
     return visible
 
 
-@serial_kernel
-def depth_order(splats: ArrayF32, tile_counts: AnyArray, keys: AnyArray, ids: AnyArray) -> int:
+@kernel
+def depth_order(
+    splats: ArrayF32, tile_counts: AnyArray, counts: AnyArray, keys: AnyArray, ids: AnyArray
+) -> int:
     """Sort the visible Gaussians by ascending depth, ties by index; return the row of ``ids`` with the order.
 
-    Positive floats sort like their bit patterns, so three passes of 11 bits are a full sort. ``keys`` and
-    ``ids`` are [2, visible] uint32 scratch.
+    Positive floats sort like their bit patterns, so three passes of 11 bits are a full sort. ``counts``
+    [chunks, `RADIX`], and ``keys`` and ``ids`` [2, visible] uint32, are scratch. Each chunk handles an equal
+    part of the Gaussians; the result does not depend on their number.
     """
-    histogram = np.zeros((RADIX_PASSES, RADIX), np.int64)
+    chunks, total, n = counts.shape[0], tile_counts.shape[0], keys.shape[1]
+    for chunk in prange(chunks):
+        counts[chunk, 0] = 0
+        for g in range(total * chunk // chunks, total * (chunk + 1) // chunks):
+            counts[chunk, 0] += tile_counts[g] > 0
+    start = 0
+    for chunk in range(chunks):
+        counts[chunk, 0], start = start, start + counts[chunk, 0]
+    for chunk in prange(chunks):
+        place = counts[chunk, 0]
+        for g in range(total * chunk // chunks, total * (chunk + 1) // chunks):
+            if tile_counts[g] > 0:
+                keys[0, place] = splats[g, layout.DEPTH : layout.DEPTH + 1].view(np.uint32)[0]
+                ids[0, place] = g
+                place += 1
     mask = np.uint32(RADIX - 1)
-    n = 0
-    for g in range(tile_counts.shape[0]):
-        if tile_counts[g] > 0:
-            key = splats[g, layout.DEPTH : layout.DEPTH + 1].view(np.uint32)[0]
-            keys[0, n] = key
-            ids[0, n] = g
-            n += 1
-            for digit in range(RADIX_PASSES):
-                histogram[digit, (key >> np.uint32(RADIX_BITS * digit)) & mask] += 1
-    source = 0
     for digit in range(RADIX_PASSES):
+        source, target, shift = digit % 2, 1 - digit % 2, np.uint32(RADIX_BITS * digit)
+        for chunk in prange(chunks):
+            counts[chunk, :] = 0
+            for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+                counts[chunk, (keys[source, i] >> shift) & mask] += 1
         start = 0
         for value in range(RADIX):
-            count = histogram[digit, value]
-            histogram[digit, value] = start
-            start += count
-        shift = np.uint32(RADIX_BITS * digit)
-        target = 1 - source
-        for i in range(n):
-            key = keys[source, i]
-            value = (key >> shift) & mask
-            place = histogram[digit, value]
-            histogram[digit, value] = place + 1
-            keys[target, place] = key
-            ids[target, place] = ids[source, i]
-        source = target
-    return source
+            for chunk in range(chunks):
+                counts[chunk, value], start = start, start + counts[chunk, value]
+        for chunk in prange(chunks):
+            for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+                key = keys[source, i]
+                value = (key >> shift) & mask
+                place = counts[chunk, value]
+                counts[chunk, value] = place + 1
+                keys[target, place] = key
+                ids[target, place] = ids[source, i]
+    return RADIX_PASSES % 2
 
 
 @kernel

@@ -84,7 +84,8 @@ class CpuRasteriser(rasteriser.Rasteriser):
         pairs = int(pair_offsets[n])
         self._require_memory(pairs, camera)
         keys, ids = self._numbers("keys", 2, visible), self._numbers("ids", 2, visible)
-        order = ids[binning.depth_order(splats, tile_counts, keys, ids)]
+        counts = self._integers("depth_counts", numba.get_num_threads(), binning.RADIX)
+        order = ids[binning.depth_order(splats, tile_counts, counts, keys, ids)]
         pair_tiles = self._numbers("pair_tiles", pairs)
         binning.list_pairs(splats, pair_offsets, width, height, pair_tiles)
         tiles = rasteriser.tiles_of(camera)
