@@ -18,7 +18,6 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from statistics import median
 
 import numpy as np
 import torch
@@ -29,15 +28,13 @@ from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, fit_motion, packed, unpacked
 from cleargs.formation.movement import Movement
 from cleargs.formation.observed import FormedView
+from cleargs.formation.shutter import ROLLING, CameraSpeeds, rolls, tested_frames, with_skew
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.types import Render, group
 from cleargs.splat.views import TrainingView
 from cleargs.types import MaskBool
 
-ROLLING = 0.015
-"""Share of the misfit that a rolling shutter must explain in addition to all else, in half of a capture's
-frames. Source: measurements in docs/formation.md."""
 ROLLING_START = 0.1
 """Share of the schedule from which frames are tested for a rolling shutter. A scene learns to look like
 skewed frames. At a place that few frames see, it hides a skew before `FormationConfig.start`
@@ -53,19 +50,6 @@ and up to 0.2 dB after 3 (docs/experiments/formation.md)."""
 SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
 """Share of frames with a model up to which a capture is sharp, and the fewest frames that tell. In a sharp
 capture a frame is not searched at its first look, unless the test finds blur."""
-MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
-"""Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
-are tested."""
-
-
-def rolls(frames: Iterable[FrameFormation]) -> bool:
-    """Return True if the capture's shutter rolls, by the skews of all frames together.
-
-    A camera's shutter rolls in every frame or in none. A single skew can also absorb an error of one frame's
-    pose or geometry.
-    """
-    gains = [frame.skew_gain for frame in frames if frame.skew_gain is not None]
-    return len(gains) >= MIN_TESTED_FRAMES and median(gains) > ROLLING
 
 
 def median_misfit(frames: Iterable[FrameFormation], weights: Mapping[int, float]) -> float:
@@ -97,16 +81,18 @@ class CaptureFormation:
         weighted = [view for view in views if view.weight > 0.0]
         self._config, self._draft = config, draft
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
-        real = sorted(view.frame_id for view in weighted if view.kind == "real")
+        filmed = sorted((v for v in weighted if v.kind == "real"), key=lambda view: view.frame_id)
+        real = [view.frame_id for view in filmed]
         known = known or {}
         self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
         if self._rolls():  # a training begins with a search
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         enough = (SETTLED - 1) * config.every
         self._settled = {frame_id for frame_id, frame in self._frames.items() if frame.draws > enough}
-        self._tested = {real[k] for k in _tested_frames(len(real))}
-        self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
-        estimated = {view.frame_id for view in weighted if view.kind == "real" and view.estimated}
+        self._tested = {real[k] for k in tested_frames(len(real))}
+        self._weights = {view.frame_id: view.weight for view in filmed}
+        self._speeds = CameraSpeeds.of(filmed)
+        estimated = {view.frame_id for view in filmed if view.estimated}
         self._posed = {"auto": estimated, "on": set(real), "off": set[int]()}[config.pose]
         cameras = {view.frame_id: view.camera for view in weighted}
         self._movement = Movement(cameras, tolerance, moving)
@@ -187,6 +173,8 @@ class CaptureFormation:
             searched = self._rolls()
         if searched and self._due(frame_id):
             self._frames[frame_id] = explained()
+            if self._all_looked_at(frame_id):
+                self._add_missing_skew()
         weight = view.weight
         motion = None
         if searched:
@@ -269,6 +257,19 @@ class CaptureFormation:
         draws = self._frames[frame_id].draws
         return draws == 0 or (draws % self._config.every == 0 and frame_id not in self._settled)
 
+    def _all_looked_at(self, frame_id: int) -> bool:
+        """Return True if a look at this frame was the last one of a round of looks at all frames."""
+        before = self._frames[frame_id].draws
+        return all(frame.draws > before for k, frame in self._frames.items() if k != frame_id)
+
+    def _add_missing_skew(self) -> None:
+        """Give all frames the skew that they lack in common. The scene follows until the next look."""
+        if self._speeds is None or not self._rolls():
+            return
+        missing = self._speeds.missing_skew(self._frames)
+        if missing is not None:
+            self._frames = {k: with_skew(frame, missing) for k, frame in self._frames.items()}
+
     def _sharp(self) -> bool:
         """Return True if few of the frames that were looked at so far needed a model."""
         models = [frame.model for frame in self._frames.values() if frame.draws > 0]
@@ -280,12 +281,6 @@ def _searched_again(looks: int) -> bool:
     """Return True for 0, `AGAIN` and its doubles: 0, 4, 8, 16, 32, ..."""
     rounds, rest = divmod(looks, AGAIN)
     return rest == 0 and rounds & (rounds - 1) == 0
-
-
-def _tested_frames(count: int) -> list[int]:
-    """Return the indices, evenly spread, of the frames that are tested for a rolling shutter."""
-    tested = min(count, max(MIN_TESTED_FRAMES, min(MAX_TESTED_FRAMES, count // 2)))
-    return [(2 * k + 1) * count // (2 * tested) for k in range(tested)]
 
 
 def _affines(exposure: Exposure, views: Sequence[TrainingView], rate: float) -> AffineOptimiser:

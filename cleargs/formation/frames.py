@@ -37,7 +37,8 @@ def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
     camera = Camera(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy, pose)
     image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
     estimated = frame.placed not in (None, GIVEN)
-    return TrainingView(frame.frame_id, camera, weight, "real", partial(_load, image, mask), estimated)
+    time = float(frame.frame_id) if frame.time_s is None else frame.time_s
+    return TrainingView(frame.frame_id, camera, weight, "real", partial(_load, image, mask), estimated, time)
 
 
 def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[TrainingView]:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cleargs.capture.folders import spread
 from cleargs.files import atomic_path
-from cleargs.formation.capture import CaptureFormation, rolls
+from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.deblur import deblur
 from cleargs.formation.exposure import read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, fit_motion
@@ -29,6 +29,7 @@ from cleargs.formation.observed import (
     pooled_unseen,
     render_observed,
 )
+from cleargs.formation.shutter import rolls
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.media.image import to_float32
 from cleargs.models.scorer import Scorer

@@ -423,7 +423,7 @@ def _fingerprint(
     seen = []
     for view in views:
         *lens, pose = vars(view.camera).values()
-        seen.append((view.frame_id, view.kind, view.weight, [*lens, *pose.ravel().tolist()]))
+        seen.append((view.frame_id, view.kind, view.weight, view.time, [*lens, *pose.ravel().tolist()]))
     parts = [settings, seen, scene.antialias, scene.background, list(others)]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -37,6 +38,9 @@ class TrainingView:
     it."""
     estimated: bool = False
     """True if the camera's pose is an estimate, and not one of the input that fits the images."""
+    time: float = math.nan
+    """Time at which the frame was taken, s, or its place in the capture where there is no clock; NaN where
+    that is not known."""
 
 
 class ViewDataset(torch.utils.data.Dataset[dict[str, Any]]):
