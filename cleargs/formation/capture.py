@@ -28,7 +28,7 @@ from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, fit_motion, packed, unpacked
 from cleargs.formation.movement import Movement
 from cleargs.formation.observed import FormedView
-from cleargs.formation.shutter import ROLLING, CameraSpeeds, rolls, tested_frames, with_skew
+from cleargs.formation.shutter import ROLLING, CameraSpeeds, frames_to_test, rolls, with_skew
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.types import Render, group
@@ -89,7 +89,7 @@ class CaptureFormation:
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         enough = (SETTLED - 1) * config.every
         self._settled = {frame_id for frame_id, frame in self._frames.items() if frame.draws > enough}
-        self._tested = {real[k] for k in tested_frames(len(real))}
+        self._tested = {real[k] for k in frames_to_test(len(real))}
         self._weights = {view.frame_id: view.weight for view in filmed}
         self._speeds = CameraSpeeds.of(filmed)
         estimated = {view.frame_id for view in filmed if view.estimated}

@@ -48,7 +48,7 @@ def rolls(frames: Iterable[FrameFormation]) -> bool:
     return len(gains) >= MIN_TESTED_FRAMES and median(gains) > ROLLING
 
 
-def tested_frames(count: int) -> list[int]:
+def frames_to_test(count: int) -> list[int]:
     """Return the indices, evenly spread, of the frames that are tested for a rolling shutter."""
     tested = min(count, max(MIN_TESTED_FRAMES, min(MAX_TESTED_FRAMES, count // 2)))
     return [(2 * k + 1) * count // (2 * tested) for k in range(tested)]

@@ -12,14 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from cleargs.formation.capture import (
-    MAX_TESTED_FRAMES,
-    MIN_TESTED_FRAMES,
-    SETTLED,
-    CaptureFormation,
-    _tested_frames,
-    rolls,
-)
+from cleargs.formation.capture import SETTLED, CaptureFormation
 from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
@@ -28,6 +21,7 @@ from cleargs.formation.movement import still_pixels
 from cleargs.formation.observed import render_observed
 from cleargs.formation.pretest import BlurEvidence
 from cleargs.formation.search import search
+from cleargs.formation.shutter import MIN_TESTED_FRAMES, CameraSpeeds
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.progress import SilentReporter
 from cleargs.splat.camera import Camera
@@ -506,26 +500,35 @@ def test_a_rolling_shutter_is_asked_for_before_anything_else(tmp_path: Path) -> 
         assert same != rolling, "asking costs a training no bit"
 
 
-def test_some_frames_spread_evenly_are_tested_for_a_rolling_shutter(tmp_path: Path) -> None:
-    formation = CaptureFormation(views(), FormationConfig(start=0.0, every=3))
-    run(tmp_path, views(), formation)
-    assert sum(frame.skew_gain is not None for frame in formation.frames.values()) == MAJORITY
-    assert _tested_frames(3) == [0, 1, 2] and _tested_frames(10) == [1, 3, 5, 7, 9]
-    assert (
-        len(_tested_frames(150)) == MAX_TESTED_FRAMES
-        and _tested_frames(150)[0] == 4
-        and _tested_frames(150)[-1] == 145
-    )
+def test_after_each_round_of_looks_the_common_skew_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All frames get it at the same time, so that the scene can follow; a resumed training does the same."""
+    rounds, seen, missing = [], skewed([0, 1, 2, 3, 4]), np.array([0, 0, 0, 0, 30.0, 0])
 
+    class Speeds:
+        def missing_skew(self, frames: dict[int, FrameFormation]) -> Any:
+            rounds.append([frame.draws for frame in frames.values()])
+            return missing if len(rounds) == 2 else None
 
-def test_few_frames_or_little_gain_tell_no_rolling_shutter() -> None:
-    def tested(gains: list[float | None]) -> list[FrameFormation]:
-        return [FrameFormation(k, skew_gain=gain) for k, gain in enumerate(gains)]
+    monkeypatch.setattr(CameraSpeeds, "of", lambda views: Speeds())
+    formation = CaptureFormation(seen, LOOK)
+    step, skews = Trainer.step, []
 
-    assert rolls(tested([0.2, 0.1, 0.1, 0.3]))
-    assert not rolls(tested([0.2, 0.1, 0.1]))
-    assert not rolls(tested([0.2, 0.1, 0.1, None]))
-    assert not rolls(tested([0.4, 0.4, 0.0, 0.0, 0.0]))
+    def stepped(trainer: Trainer) -> None:
+        step(trainer)
+        skews.append([frame.motion.skew[4] for frame in formation.frames.values()])
+
+    monkeypatch.setattr(Trainer, "step", stepped)
+    run(tmp_path, seen, formation)
+    # 60 steps on five frames, looked at after every fourth step on them.
+    assert len(rounds) == 3
+    for k, draws in enumerate(rounds):
+        # The last frame of a round is counted after its look.
+        assert sorted(draws) == [4 * k, *[4 * k + 1] * 4]
+    jumps = np.diff(np.array(skews), axis=0)
+    together = [k for k, jump in enumerate(jumps) if (jump > 20.0).all()]
+    assert len(together) == 1, "all frames get it in one step, once"
 
 
 def test_trust_is_earned() -> None:
