@@ -29,9 +29,9 @@ frames. Source: measurements in docs/formation.md."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
-MIN_TIMED_FRAMES, MAX_GAP = 8, 2.0
-"""Fewest frames with a speed that tell the readout time, and the longest gap between a frame with a speed and
-its neighbours, as a multiple of the median gap."""
+MIN_TIMED_FRAMES, UNEVEN = 8, 2.0
+"""Fewest frames with a speed that tell the readout time, and the factor from the median gap between frames to
+the shortest and the longest one at a frame with a speed. In a shorter gap an error of a pose weighs more."""
 MIN_CORRELATION = 0.4
 """Least correlation of skews and speeds from which the slope is taken for the readout time."""
 WITH_SKEW: dict[Model, Model] = {"none": "skew", "blur": "both", "skew": "skew", "both": "both"}
@@ -76,9 +76,9 @@ class CameraSpeeds:
         turns = 0.5 * (rates - rates.transpose(0, 2, 1))
         focal = np.array([view.camera.fx for view in views])
         twists = np.column_stack([rates[:, :3, 3], turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]])
-        timed = np.maximum(gaps[:-1], gaps[1:]) <= MAX_GAP * np.median(gaps)
-        inner = zip(views[1:-1], focal[1:-1], twists[1:-1], timed, strict=True)
-        per_frame = {view.frame_id: scale * twist for view, scale, twist, near in inner if near}
+        even = np.abs(np.log(gaps / np.median(gaps))) <= math.log(UNEVEN)
+        inner = zip(views[1:-1], focal[1:-1], twists[1:-1], even[:-1] & even[1:], strict=True)
+        per_frame = {view.frame_id: scale * twist for view, scale, twist, timed in inner if timed}
         return cls(per_frame, _image_motion(views[0].camera))
 
     def missing_skew(self, frames: Mapping[int, FrameFormation]) -> ArrayF64 | None:

@@ -106,10 +106,13 @@ def test_few_frames_or_unknown_times_give_no_speed() -> None:
     assert speeds.missing_skew(few) is None
 
 
-def test_a_frame_at_a_long_gap_has_no_speed() -> None:
+def test_a_frame_at_a_long_or_a_short_gap_has_no_speed() -> None:
     speeds = CameraSpeeds.of(walk(np.concatenate([TIMES[:8], TIMES[11:], TIMES[11:] + 1.2])))
     assert speeds is not None
     assert sorted(speeds.per_frame) == [*range(1, 7), *range(9, 12), *range(14, 17)]
+    speeds = CameraSpeeds.of(walk(np.sort(np.append(TIMES, TIMES[5] + 0.01))))
+    assert speeds is not None
+    assert sorted(speeds.per_frame) == [*range(1, 5), *range(7, FRAMES)]
 
 
 @pytest.mark.parametrize(
