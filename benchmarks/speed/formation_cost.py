@@ -24,9 +24,9 @@ from benchmarks.speed.timing import Quartiles, interleave, ratio
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
 from cleargs.formation.observed import FormedView
-from cleargs.formation.warp import displacement_fields, linear_curve, srgb_curve, through_curve, times_slope
+from cleargs.formation.warp import displacement_fields, linear_curve, srgb_curve
 from cleargs.progress import Reporter
-from cleargs.splat.backend import psnr, rasteriser_for
+from cleargs.splat.backend import backend_for, psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.rasteriser import Rasteriser
@@ -150,11 +150,13 @@ def _methods(
 def _truth(length: float, gaussians: Gaussians, camera: Camera) -> Tensor:
     """Return the exposure [H, W, 3]: the mean in linear light of many renders along the path, as sRGB."""
     motion = motion_of(length, _median_depth(gaussians, camera))
-    engine, total = rasteriser_for(), np.zeros((camera.height, camera.width, 3))
+    engine, backend = rasteriser_for(), backend_for(CPU)
+    total = np.zeros((camera.height, camera.width, 3))
     poses = poses_along(camera, motion, max(9, round(TRUTH_PER_PIXEL * length)))
     for pose in poses:
-        total += through_curve(engine.forward(gaussians, pose).image, linear_curve(CPU))[0].numpy()
-    return through_curve(torch.from_numpy((total / len(poses)).astype(np.float32)), srgb_curve(CPU))[0]
+        total += backend.through_curve(engine.forward(gaussians, pose).image, linear_curve(CPU), 3)[0].numpy()
+    mean = torch.from_numpy((total / len(poses)).astype(np.float32))
+    return backend.through_curve(mean, srgb_curve(CPU), 3)[0]
 
 
 def _median_depth(gaussians: Gaussians, camera: Camera) -> float:
@@ -191,6 +193,7 @@ class _MeanOfRenders(Iteration):
 
     def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion, count: int) -> None:
         super().__init__(gaussians, camera)
+        self._backend = backend_for(CPU)
         self._poses = poses_along(camera, motion, count)
         self._engines = [rasteriser_for() for _ in self._poses]
 
@@ -198,16 +201,17 @@ class _MeanOfRenders(Iteration):
         total = torch.zeros(self.camera.height, self.camera.width, 3)
         self._slopes = []
         for engine, pose in zip(self._engines, self._poses, strict=True):
-            light, slope = through_curve(engine.forward(self.gaussians, pose).image, linear_curve(CPU))
+            image = engine.forward(self.gaussians, pose).image
+            light, slope = self._backend.through_curve(image, linear_curve(CPU), 3)
             total += light
             self._slopes.append(slope)
-        mean, self._slope_of_mean = through_curve(total / len(self._poses), srgb_curve(CPU))
+        mean, self._slope_of_mean = self._backend.through_curve(total / len(self._poses), srgb_curve(CPU), 3)
         return mean
 
     def backward(self, gradient: Tensor) -> Gaussians:
-        light = times_slope(gradient, self._slope_of_mean) / len(self._poses)
+        light = self._backend.times_slope(gradient, self._slope_of_mean, 3) / len(self._poses)
         found = [
-            engine.backward(times_slope(light, of_render))
+            engine.backward(self._backend.times_slope(light, of_render, 3))
             for engine, of_render in zip(self._engines, self._slopes, strict=True)
         ]
         for name, total in found[0].tensors().items():

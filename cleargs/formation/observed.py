@@ -15,14 +15,7 @@ from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, margin_for
 from cleargs.formation.motion import widened
 from cleargs.formation.movement import counted
-from cleargs.formation.warp import (
-    Warp,
-    displacement_fields,
-    linear_curve,
-    srgb_curve,
-    through_curve,
-    times_slope,
-)
+from cleargs.formation.warp import Warp, displacement_fields, linear_curve, srgb_curve
 from cleargs.splat.backend import backend_for, psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.rasteriser import Rasteriser
@@ -63,13 +56,14 @@ class FormedView:
     def forward(self, render: Render) -> Tensor:
         """Return the photograph [H, W, 3] sRGB of a render at ``camera``."""
         image, device = render.image, render.image.device
+        backend = backend_for(device)
         if self.affine is not None:
             self._rendered = render.image
-            image = backend_for(device).apply_affine(image, self.affine)
+            image = backend.apply_affine(image, self.affine)
         if self.formation is not None:
             self._warp = self.warp(render)
-            linear, self._to_linear = through_curve(image, linear_curve(device), CHANNELS)
-            image, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(device))
+            linear, self._to_linear = backend.through_curve(image, linear_curve(device), CHANNELS)
+            image, self._to_srgb = backend.through_curve(self._warp.forward(linear), srgb_curve(device), 3)
         if self.look is not None:
             self.mask = self.look(image, render, self._margin)
         return image
@@ -84,11 +78,11 @@ class FormedView:
 
     def backward(self, gradient: Tensor) -> Tensor:
         """Return the gradient by the render's image, from that by the photograph."""
+        backend = backend_for(gradient.device)
         if self.formation is not None:
-            light = times_slope(gradient, self._to_srgb, CHANNELS)
-            gradient = times_slope(self._warp.transpose(light), self._to_linear)
+            light = backend.times_slope(gradient, self._to_srgb, CHANNELS)
+            gradient = backend.times_slope(self._warp.transpose(light), self._to_linear, 3)
         if self.affine is not None:
-            backend = backend_for(gradient.device)
             gradient, self._affine_gradient = backend.affine_backward(self._rendered, self.affine, gradient)
         return gradient
 

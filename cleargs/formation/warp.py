@@ -170,20 +170,6 @@ def padded(image: ArrayF32) -> ArrayF32:
     return np.concatenate([image, np.zeros_like(image[..., :1])], axis=2)
 
 
-def through_curve(image: Tensor, curve: Tensor, channels: int = 3) -> tuple[Tensor, Tensor]:
-    """Map the colours of ``image`` [H, W, 3 or 4] through `linear_curve` or `srgb_curve`.
-
-    Returns:
-        The image with ``channels`` channels, and the slopes of the curve there [H, W, 3].
-    """
-    return backend_for(image.device).through_curve(image, curve, channels)
-
-
-def times_slope(light: Tensor, slope: Tensor, channels: int = 3) -> Tensor:
-    """Return ``light`` [H, W, 3 or 4] times ``slope`` [H, W, 3], as an image of ``channels``."""
-    return backend_for(light.device).times_slope(light, slope, channels)
-
-
 @cache
 def linear_curve(device: torch.device) -> Tensor:
     """Return the curve from sRGB to linear light, [CURVE_STEPS + 1]."""

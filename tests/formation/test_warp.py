@@ -35,11 +35,9 @@ from cleargs.formation.warp import (
     padded,
     samples,
     srgb_curve,
-    through_curve,
-    times_slope,
 )
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.splat.backend import set_threads
+from cleargs.splat.backend import backend_for, set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST, MAX_NEARNESS, DisplacementFields
 
@@ -308,7 +306,7 @@ def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
     usual = (values > 0) & (values < CURVE_LAST)
 
     def followed(image: Image, curve: Tensor) -> tuple[Image, Image]:
-        out, slope = through_curve(torch.from_numpy(image), curve)
+        out, slope = backend_for(CPU).through_curve(torch.from_numpy(image), curve, 3)
         return out.numpy(), slope.numpy()
 
     for curve, formula, tolerance in (
@@ -329,7 +327,7 @@ def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
 
 
 def test_the_whole_chain_has_the_gradient_that_finite_differences_show() -> None:
-    fields = wall_fields(ALL)
+    fields, backend = wall_fields(ALL), backend_for(CPU)
     warp = Warp.of(fields)
     rng = np.random.default_rng(3)
     image = torch.from_numpy(rng.uniform(0.2, 0.8, (*wall().shape, 3)).astype(np.float32))
@@ -338,10 +336,10 @@ def test_the_whole_chain_has_the_gradient_that_finite_differences_show() -> None
     )
 
     def chain(picture: Tensor) -> tuple[float, Tensor]:
-        linear, to_linear = through_curve(picture, linear_curve(CPU), CHANNELS)
-        photo, to_srgb = through_curve(warp.forward(linear), srgb_curve(CPU))
-        back = times_slope(weight, to_srgb, CHANNELS)
-        return dot(photo, weight), times_slope(warp.transpose(back), to_linear)
+        linear, to_linear = backend.through_curve(picture, linear_curve(CPU), CHANNELS)
+        photo, to_srgb = backend.through_curve(warp.forward(linear), srgb_curve(CPU), 3)
+        back = backend.times_slope(weight, to_srgb, CHANNELS)
+        return dot(photo, weight), backend.times_slope(warp.transpose(back), to_linear, 3)
 
     _, gradient = chain(image)
     step = 2e-3

@@ -17,16 +17,9 @@ from torch import Tensor
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.warp import (
-    Warp,
-    displacement_fields,
-    enough_samples,
-    linear_curve,
-    srgb_curve,
-    through_curve,
-    times_slope,
-)
+from cleargs.formation.warp import Warp, displacement_fields, enough_samples, linear_curve, srgb_curve
 from cleargs.progress import SilentReporter
+from cleargs.splat.backend import backend_for
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST
@@ -90,8 +83,9 @@ def test_curves_are_those_of_the_cpu(
     values = torch.linspace(-0.2, CURVE_LAST + 0.3, 50 * stored).reshape(5, 10, stored)
 
     def follow(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        out, slope = through_curve(image, curve(image.device), channels)
-        return out.cpu(), slope.cpu(), times_slope(out, slope, CHANNELS).cpu()
+        backend = backend_for(image.device)
+        out, slope = backend.through_curve(image, curve(image.device), channels)
+        return out.cpu(), slope.cpu(), backend.times_slope(out, slope, CHANNELS).cpu()
 
     found, expected = both(follow, values)
     for mine, theirs in zip(found, expected, strict=True):
