@@ -1,16 +1,14 @@
-"""Log of a training, one row per step, and the ``preview.png`` next to a checkpoint."""
+"""Log of a training, one row per step."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import torch
 from torch import Tensor
 
-from cleargs.media.image import write_rgb
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.types import Reading
 from cleargs.splat.views import TrainingView
@@ -25,9 +23,6 @@ _ROW = np.dtype(
 """Type of a row in memory; ``kind`` is True for a pseudo view."""
 
 _RECENT = 50  # number of steps in the running mean of the PSNR
-
-PREVIEW_SIDE = 640
-"""Maximum of the longer side of a preview, px."""
 
 
 class TrainLog:
@@ -83,8 +78,3 @@ class TrainLog:
             "kind": np.where(rows["kind"], "pseudo", "real"),
         }
         return pa.table({name: pa.array(columns[name]) for name in TRAIN.names}).cast(TRAIN)
-
-
-def write_preview(path: Path, image: Tensor) -> None:  # [H, W, 3] sRGB
-    """Write ``image`` atomically as a PNG, its values clipped to [0, 1]."""
-    write_rgb(path, image.cpu().numpy())

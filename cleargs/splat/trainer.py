@@ -23,6 +23,7 @@ from torch import Tensor
 
 from cleargs import kernel_cache
 from cleargs.errors import InputError, StageError
+from cleargs.media.image import write_rgb
 from cleargs.progress import COMPILING, PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
 from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
@@ -39,11 +40,13 @@ from cleargs.splat.kernels.rasteriser import view_numbers
 from cleargs.splat.scene import Colour, Scene
 from cleargs.splat.schedule import Schedule, random_grey
 from cleargs.splat.state import load_state, save_state
-from cleargs.splat.train_log import PREVIEW_SIDE, TrainLog, write_preview
+from cleargs.splat.train_log import TrainLog
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, TrainingView, require_views
 
 _NOTE_INTERVAL = 10  # steps between updates of the progress bar, and on a GPU between updates of the log
+
+_PREVIEW_SIDE = 640  # maximum of the longer side of a preview, px
 
 _CHECK_INTERVAL = 10
 """Steps between checks for NaN and infinity (a check takes less than 1 ms for 50,000 Gaussians)."""
@@ -157,7 +160,7 @@ class Trainer:
                     self.check_finite()
                 if due:
                     save_state(checkpoint, self.state())
-                    write_preview(checkpoint.with_name(PREVIEW), self.preview())
+                    write_rgb(checkpoint.with_name(PREVIEW), self.preview().cpu().numpy())
                     next_save = _next_save(now, time.monotonic())
                 if stopped:
                     raise KeyboardInterrupt
@@ -236,7 +239,7 @@ class Trainer:
     def preview(self) -> Tensor:
         """Return a reduced image [H, W, 3] sRGB of the view with the largest weight, valid for one step."""
         view = max(self._real or self._pseudo, key=lambda view: view.weight)
-        camera = view.camera.scaled(min(1.0, PREVIEW_SIDE / max(view.camera.width, view.camera.height)))
+        camera = view.camera.scaled(min(1.0, _PREVIEW_SIDE / max(view.camera.width, view.camera.height)))
         return self._render(camera, depth=False).image
 
     def work_fractions(self) -> list[float]:

@@ -14,16 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import torch
 from report_run import FinishedRun, camera, wall
 from watched import reported, serving, working
 
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
+from cleargs.media.image import write_rgb
 from cleargs.progress import PREVIEW
 from cleargs.report.serve import Server
 from cleargs.splat.render import Viewer
-from cleargs.splat.train_log import write_preview
 
 
 @dataclass
@@ -94,8 +93,7 @@ def test_a_running_stage_shows_progress_and_preview(finished: FinishedRun, port:
         }
         versions = []
         for seed in (1, 2):
-            image = Viewer(wall(seed)).view
-            write_preview(checkpoints / "round_01" / PREVIEW, torch.from_numpy(image(camera(1)) / 255))
+            write_rgb(checkpoints / "round_01" / PREVIEW, Viewer(wall(seed)).view(camera(1)))
             versions.append(json.loads(ask(port, "/state.json").body)["preview"])
             shown = ask(port, "/preview.png?1")
             assert shown.headers["content-type"] == "image/png"

@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-import torch
 from helpers.chromium import CHROMIUM, NO_CHROMIUM, TIMEOUT_MS
 from report_run import camera, wall
 from watched import reported, serving, working
 
+from cleargs.media.image import write_rgb
 from cleargs.pipeline import live
 from cleargs.progress import PREVIEW
 from cleargs.splat.render import Viewer
-from cleargs.splat.train_log import write_preview
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
@@ -31,7 +31,7 @@ def until(page: Any, condition: str) -> None:
 def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "WRITE_INTERVAL_S", 0.0)
     made = reported(tmp_path)
-    picture = torch.from_numpy(Viewer(wall(1)).view(camera(1)) / 255)
+    picture = Viewer(wall(1)).view(camera(1))
     complaints: list[str] = []
     with serving(made) as port:
         page = browser.new_page()
@@ -42,14 +42,14 @@ def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pyt
             until(page, "document.title.startsWith('g0 ')")
             assert page.is_hidden("#preview")
             task.update(done=50, note="20.5 dB, 1000 Gaussians")
-            write_preview(checkpoints / PREVIEW, picture)
+            write_rgb(checkpoints / PREVIEW, picture)
             until(page, "document.querySelector('#picture').naturalWidth === 96")
             assert page.inner_text("#label") == "<b>G0</b>"  # no markup
             assert page.inner_text("#figures") == "50 of 200 · 20.5 dB, 1000 Gaussians"
             assert page.evaluate("document.querySelector('#progress').value") == 0.25
             assert page.inner_text("li[data-state='running']").split() == ["g0", "running"]
             first = page.get_attribute("#picture", "src")
-            write_preview(checkpoints / PREVIEW, picture.flip(0))
+            write_rgb(checkpoints / PREVIEW, np.flipud(picture).copy())
             until(page, f"document.querySelector('#picture').getAttribute('src') !== '{first}'")
         page.wait_for_url("**/report/")
         assert page.inner_text("h1") and not complaints
