@@ -13,7 +13,7 @@ import torch
 
 from cleargs.errors import StoreError
 from cleargs.files import atomic_path
-from cleargs.safe_io import FAULTS, cause, open_regular
+from cleargs.safe_io import faults_as, open_regular
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
@@ -62,7 +62,8 @@ def read_ply(path: Path) -> Scene:
     Raises StoreError if the file is missing or truncated, lacks a property, or has a value that is not
     finite.
     """
-    try:
+    hint = "repeat the stage that wrote it with --force"
+    with faults_as(StoreError, f"cannot read the scene {path}", hint=hint):
         with open_regular(path) as file:
             count, names, comments = _read_header(file)
             rows = np.frombuffer(file.read(), dtype="<f4").reshape(count, len(names))
@@ -94,11 +95,6 @@ def read_ply(path: Path) -> Scene:
             if not bool(torch.isfinite(values).all()):
                 raise ValueError(f"some {name} are not finite")
         return Scene(gaussians, antialias=comments.get(_ANTIALIAS, "none") == "mip", background=background)
-    except FAULTS as error:
-        raise StoreError(
-            f"cannot read the scene {path}: {cause(error)}",
-            hint="repeat the stage that wrote it with --force",
-        ) from error
 
 
 def _read_header(file: BinaryIO) -> tuple[int, list[str], dict[str, str]]:
