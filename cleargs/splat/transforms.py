@@ -86,8 +86,7 @@ def transform_scene(
         sh=torch.einsum("jk,nkc->njc", mixing, gaussians.sh.double()).float().contiguous(),
     )
     reach, before = (float(g.means.abs().max()) if g.num else 1.0 for g in (transformed, gaussians))
-    finite = all(bool(torch.isfinite(tensor).all()) for tensor in transformed.tensors().values())
-    if not finite or reach > MAX_REACH or (before > 0.0 and reach < 1.0 / MAX_REACH):
+    if transformed.fault() or reach > MAX_REACH or (before > 0.0 and reach < 1.0 / MAX_REACH):
         raise InputError(
             "the coordinates of the scene in that world exceed the range of float32",
             hint="export the scene in the normalised world (without --world input)",
