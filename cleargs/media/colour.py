@@ -51,12 +51,9 @@ def rgb_from_yuv(yuv: NDArray[F], matrix: str, bits: int, *, full_range: bool) -
     """
     kr, kb = LUMA[matrix]
     step = 2.0 ** (bits - 8)
-    if full_range:
-        peak = 2.0**bits - 1
-        y, u, v = yuv[0] / peak, (yuv[1] - 128 * step) / peak, (yuv[2] - 128 * step) / peak
-    else:
-        y = (yuv[0] - 16 * step) / (219 * step)
-        u, v = (yuv[1] - 128 * step) / (224 * step), (yuv[2] - 128 * step) / (224 * step)
+    peak = 2.0**bits - 1
+    black, luma, chroma = (0.0, peak, peak) if full_range else (16 * step, 219 * step, 224 * step)
+    y, u, v = (yuv[0] - black) / luma, (yuv[1] - 128 * step) / chroma, (yuv[2] - 128 * step) / chroma
     red = y + 2 * (1 - kr) * v
     blue = y + 2 * (1 - kb) * u
     green = (y - kr * red - kb * blue) / (1 - kr - kb)
