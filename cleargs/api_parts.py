@@ -54,15 +54,13 @@ def initialise(
         scene = cg.initialise(capture, config=cg.G0Config(sh_degree=1))
     """
     from cleargs import G0Config
-    from cleargs.capture.tables import load_observations
-    from cleargs.splat.initialise import SparsePoints, starting_gaussians
+    from cleargs.formation.frames import seen_points
+    from cleargs.splat.initialise import starting_gaussians
     from cleargs.splat.scene import BLACK, Scene
 
     views = capture.views() if views is None else views
     config = resolve_config(config or G0Config(), views)
-    points, observations = capture.points, load_observations(capture.folder)
-    frame_ids = [view.frame_id for view in views]
-    sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
+    sparse = seen_points(capture.points, capture.folder, views)
     gaussians = starting_gaussians(
         sparse,
         views,

@@ -98,10 +98,10 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
 def run(context: StageContext[G0Config]) -> StageResult:
     """Make Gaussians of the sparse points and train them on the active frames with their RVA weights."""
     from cleargs.capture.folders import spread
-    from cleargs.capture.tables import load_frames, load_observations, load_points
+    from cleargs.capture.tables import load_frames, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, frame_gains, gain_spread, write_exposure
-    from cleargs.formation.frames import real_views
+    from cleargs.formation.frames import real_views, seen_points
     from cleargs.formation.movement import TOLERANCE, write_movement
     from cleargs.formation.observed import MAX_EVALUATED, evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
@@ -109,7 +109,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
     from cleargs.splat.backend import mean_psnr, set_threads
     from cleargs.splat.budget import resolve_config
-    from cleargs.splat.initialise import SparsePoints, starting_gaussians
+    from cleargs.splat.initialise import starting_gaussians
     from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import BLACK, Scene
     from cleargs.splat.state import save_state
@@ -122,9 +122,8 @@ def run(context: StageContext[G0Config]) -> StageResult:
     allocation = read_table(context.inputs["rva"] / "frames.parquet", RVA_FRAMES).to_pylist()
     views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
     require_views(views)
-    points, frame_ids = load_points(ingest), [view.frame_id for view in views]
-    observations = load_observations(ingest)
-    sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
+    weights = {view.frame_id: view.weight for view in views}
+    sparse = seen_points(load_points(ingest), ingest, views)
 
     config = resolve_config(config, views)
     gaussians = starting_gaussians(
@@ -140,7 +139,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     exposure_spread = gain_spread(gains)
     alike = exposure_spread <= config.exposure_threshold
     off = config.exposure == "off" or (config.exposure == "auto" and alike)
-    exposure = None if off else Exposure.from_gains(frame_ids, gains)
+    exposure = None if off else Exposure.from_gains(list(weights), gains)
     formation = CaptureFormation(
         views,
         config.formation,
@@ -159,14 +158,13 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
     checkpoint = context.checkpoints / "g0.safetensors"
     trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
-    learned = formation.exposure or Exposure.identity(frame_ids)
+    learned = formation.exposure or Exposure.identity(list(weights))
     moving = formation.moving
     few = spread(views, MAX_EVALUATED)
     fits = evaluate_views(trained.scene.to(context.device), few, learned, formation.frames, moving=moving)
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
     write_exposure(context.out / "exposure.parquet", learned)
-    weights = {view.frame_id: view.weight for view in views}
     write_formation(context.out / "formation.parquet", formation, weights)
     write_movement(context.out / "movement.parquet", moving)
     save_state(context.out / "state.safetensors", trained.state)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from cleargs.capture.tables import Frame
+from cleargs.capture.tables import Frame, Points, load_observations
 from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
+from cleargs.splat.initialise import SparsePoints
 from cleargs.splat.views import TrainingView
 from cleargs.types import AnyImage, MaskBool
 
@@ -54,6 +55,14 @@ def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Pa
     return [
         view_of(frame, folder, weights[frame.frame_id]) for frame in sorted(active, key=lambda f: f.frame_id)
     ]
+
+
+def seen_points(points: Points, ingest: Path, views: Sequence[TrainingView]) -> SparsePoints:
+    """Return all ``points``, and which of them each view observes by the tables in ``ingest``."""
+    frame_id, point_id = load_observations(ingest)
+    order = np.argsort(points.point_id)
+    rows = order[np.searchsorted(points.point_id, point_id, sorter=order)]
+    return SparsePoints(points.xyz, points.rgb, [rows[frame_id == view.frame_id] for view in views])
 
 
 def _load(image: Path, mask: Path | None) -> tuple[AnyImage, MaskBool | None]:

@@ -36,21 +36,6 @@ class SparsePoints:
     observed: list[NDArray[np.int64]]
     """Rows of ``xyz`` that each view observes."""
 
-    @classmethod
-    def seen_by(
-        cls,
-        frame_ids: Sequence[int],
-        point_id: NDArray[np.int64],  # [P]
-        xyz: NDArray[np.float64],  # [P, 3]
-        rgb: NDArray[np.uint8],  # [P, 3]
-        observations: tuple[NDArray[np.int32], NDArray[np.int64]],  # frame_id [M], point_id [M]
-    ) -> SparsePoints:
-        """Return all points, and the rows of ``xyz`` that each frame of ``frame_ids`` observes."""
-        order = np.argsort(point_id)
-        frame, point = observations
-        index = order[np.searchsorted(point_id, point, sorter=order)]
-        return cls(xyz, rgb, [index[frame == wanted] for wanted in frame_ids])
-
 
 def starting_gaussians(
     sparse: SparsePoints,
