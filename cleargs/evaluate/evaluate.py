@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from cleargs.capture.folders import image_files
 from cleargs.digest import file_digest
@@ -44,7 +43,7 @@ from cleargs.splat.backend import decibels, rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
-from cleargs.types import ImageU8, MaskBool, PlaneF32
+from cleargs.types import ArrayF64, ImageU8, MaskBool, PlaneF32
 
 IN_FRONT = 0.85
 """Depth, over that of the true surface, below which the centre of a Gaussian is in front of it."""
@@ -56,8 +55,8 @@ _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 class _Prediction:
     """Image of a method at a reference's view, before colour alignment."""
 
-    image: NDArray[np.float64]  # [H, W, 3] sRGB in [0, 1]
-    over_white: NDArray[np.float64] | None = None
+    image: ArrayF64  # [H, W, 3] sRGB in [0, 1]
+    over_white: ArrayF64 | None = None
     """The same render over white; None for finished images."""
     refinement: Refinement | None = None
     far: MaskBool | None = None
@@ -140,11 +139,11 @@ def evaluate_images(
     return found
 
 
-def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | None) -> Predict:
+def _renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None) -> Predict:
     """Return a function that renders a scene at references' views, with poses refined in ``refine_steps``."""
     engine = rasteriser_for(scene.gaussians.device)
 
-    def render(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def render(camera: Camera) -> tuple[ArrayF64, ArrayF64]:
         """Return the image over the scene's background, and over white."""
         image, alpha, _ = engine.view(scene, camera)
         pixels, through = image.numpy().astype(np.float64), 1.0 - alpha.numpy().astype(np.float64)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.evaluate.config import INSTALLABLE, EvalOptions
 from cleargs.evaluate.eval_report import Region
@@ -21,7 +20,7 @@ from cleargs.models.lpips import load_lpips, weights_file
 from cleargs.models.registry import file_digest, model_dir
 from cleargs.models.scorer import Scorer, load_scorer
 from cleargs.splat.camera import Camera
-from cleargs.types import ImageF32, ImageU8, MaskBool, PlaneF32
+from cleargs.types import ArrayF64, ImageF32, ImageU8, MaskBool, PlaneF32
 
 WINDOW = 11
 SIGMA = 1.5
@@ -69,7 +68,7 @@ def ssim(image: ImageU8, reference: ImageU8, mask: MaskBool | None = None) -> fl
     return float(similarity.mean()) if similarity.size else None
 
 
-def _windowed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _windowed(values: ArrayF64) -> ArrayF64:
     """Return the Gaussian mean [H, W, 3] of the window around each pixel."""
     kernel = cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_64F)
     return np.asarray(cv2.sepFilter2D(values, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101))
@@ -126,9 +125,7 @@ def load_metrics(options: EvalOptions) -> MetricSet:
     return MetricSet(lpips, scorers, weights, unavailable)
 
 
-def fit_affine(
-    image: NDArray[np.float64], reference: NDArray[np.float64], mask: MaskBool | None
-) -> NDArray[np.float64]:  # [3, 4]
+def fit_affine(image: ArrayF64, reference: ArrayF64, mask: MaskBool | None) -> ArrayF64:  # [3, 4]
     """Matrix and offset of least squares on sRGB in [0, 1]; the identity when no pixel counts."""
     x = image.reshape(-1, 3) if mask is None else image[mask]
     y = reference.reshape(-1, 3) if mask is None else reference[mask]
@@ -142,7 +139,7 @@ def fit_affine(
     return np.asarray(np.linalg.solve(normal, right).T)
 
 
-def apply_affine(image: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.float64]:
+def apply_affine(image: ArrayF64, affine: ArrayF64) -> ArrayF64:
     """Return the image [H, W, 3] mapped by ``affine`` [3, 4] and clipped to [0, 1]."""
     return np.asarray(np.einsum("hwj,ij->hwi", image, affine[:, :3]) + affine[:, 3]).clip(0.0, 1.0)
 
@@ -150,7 +147,7 @@ def apply_affine(image: NDArray[np.float64], affine: NDArray[np.float64]) -> NDA
 # -- regions: the far, and the clipped, where scenes fail that look well on average ----------------------
 
 
-def depth_of_points(points: NDArray[np.float64], camera: Camera) -> float | None:
+def depth_of_points(points: ArrayF64, camera: Camera) -> float | None:
     """Return the depth behind which the view has no sparse points; None if it sees fewer than `FEWEST`.
 
     ``points`` [P, 3] are in the scene's world.

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
@@ -32,7 +31,7 @@ from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
-from cleargs.types import ImageU8, MaskBool
+from cleargs.types import ArrayF64, ImageU8, MaskBool
 
 T = TypeVar("T")
 
@@ -84,7 +83,7 @@ class Reference:
     views: tuple[ReferenceView, ...]
     poses: PosesFrom
     alignment: Alignment
-    points: NDArray[np.float64] | None = None
+    points: ArrayF64 | None = None
     """The run's sparse points [P, 3], in the scene's world; None without a run."""
 
 
@@ -218,14 +217,12 @@ def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Simil
     )
 
 
-def _with_axes(
-    poses: Sequence[Pose], centres: NDArray[np.float64], length: float
-) -> NDArray[np.float64]:  # [4 N, 3]
+def _with_axes(poses: Sequence[Pose], centres: ArrayF64, length: float) -> ArrayF64:  # [4 N, 3]
     axes = np.stack([pose.rotation for pose in poses])  # rows: the camera's axes in the world
     return np.concatenate([centres, (centres[:, None] + length * axes).reshape(-1, 3)])
 
 
-def umeyama(source: NDArray[np.float64], target: NDArray[np.float64]) -> Similarity:
+def umeyama(source: ArrayF64, target: ArrayF64) -> Similarity:
     """Return the least-squares similarity from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
 
     Both are the centres [N, 3] of the same cameras. Raises InputError for fewer than three centres, or for

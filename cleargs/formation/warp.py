@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.motion import FrameMotion
@@ -17,7 +16,7 @@ from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels import warp_layout as layout
 from cleargs.splat.kernels.warp_layout import CUBE_REACH, DisplacementFields
-from cleargs.types import ArrayF32
+from cleargs.types import ArrayF32, ArrayF64
 
 SAMPLES_PER_PIXEL = 1.0
 """Samples per pixel of a blur's length. With 0.7 scenes end less sharp (up to 0.2 dB, a tenth more LPIPS),
@@ -182,5 +181,5 @@ def srgb_curve(device: torch.device) -> Tensor:
     return torch.from_numpy(srgb_from_linear(_places()).astype(np.float32)).to(device)
 
 
-def _places() -> NDArray[np.float64]:
+def _places() -> ArrayF64:
     return np.linspace(0.0, layout.CURVE_LAST, layout.CURVE_STEPS + 1)

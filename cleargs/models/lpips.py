@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -24,7 +23,7 @@ from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.safe_io import FAULTS, faults_as
-from cleargs.types import ImageF32
+from cleargs.types import AnyArray, ImageF32
 
 Net = Literal["alex", "vgg"]
 
@@ -147,7 +146,7 @@ class _ArrayUnpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"the pickle asks for {module}.{name}")
 
 
-def _empty_array(kind: type, shape: tuple[int, ...], _dtype: bytes) -> NDArray[Any]:
+def _empty_array(kind: type, shape: tuple[int, ...], _dtype: bytes) -> AnyArray:
     if kind is not np.ndarray or shape != (0,):
         raise pickle.UnpicklingError("the pickle builds something other than an array")
     return np.empty(0, np.int8)
@@ -182,7 +181,7 @@ def _planes(image: ImageF32) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)
 
 
-def _oihw(kernel: NDArray[Any]) -> Tensor:
+def _oihw(kernel: AnyArray) -> Tensor:
     return torch.from_numpy(np.array(kernel, np.float32).transpose(3, 2, 0, 1).copy())
 
 

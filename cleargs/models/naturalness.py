@@ -15,12 +15,11 @@ from importlib.resources import files
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from cleargs.base_model import FrozenModel
 from cleargs.models.tiling import mean_over_tiles
-from cleargs.types import ImageF32
+from cleargs.types import ArrayF64, ImageF32
 
 COEFFICIENTS = "naturalness.toml"
 
@@ -39,7 +38,7 @@ class Quadratic(FrozenModel):
     deviation: tuple[float, ...] = Field(description="Standard deviation of each feature over the patches.")
     weights: tuple[float, ...] = Field(description="Weight of each term.")
 
-    def __call__(self, features: NDArray[np.float64]) -> float:
+    def __call__(self, features: ArrayF64) -> float:
         """Return the prediction for features [F]."""
         return float(terms(features, np.array(self.mean), np.array(self.deviation)) @ np.array(self.weights))
 
@@ -75,7 +74,7 @@ def expected_value(estimate: float) -> float:
     return float(_ERROR_SCALE * (below - above))
 
 
-def features(image: ImageF32) -> NDArray[np.float64]:  # [H, W, 3] sRGB in [0, 1]
+def features(image: ImageF32) -> ArrayF64:  # [H, W, 3] sRGB in [0, 1]
     """Return nine statistics at full size and nine at half size, [18].
 
     At each size: logarithms of the variance and the kurtosis of the MSCN coefficients; their correlations at
@@ -88,10 +87,10 @@ def features(image: ImageF32) -> NDArray[np.float64]:  # [H, W, 3] sRGB in [0, 1
 
 
 def terms(
-    features: NDArray[np.float64],  # [..., F]
-    mean: NDArray[np.float64],  # [F]
-    deviation: NDArray[np.float64],  # [F]
-) -> NDArray[np.float64]:
+    features: ArrayF64,  # [..., F]
+    mean: ArrayF64,  # [F]
+    deviation: ArrayF64,  # [F]
+) -> ArrayF64:
     """Return the terms of the quadratic, [..., 1 + F + F (F + 1) / 2]: 1, features, products of two."""
     z = np.clip((features - mean) / deviation, -_MAX_DEVIATIONS, _MAX_DEVIATIONS)
     i, j = np.triu_indices(z.shape[-1])

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StageError
 from cleargs.plugins import installed_version
 from cleargs.safe_io import faults_as, read_bytes
+from cleargs.types import AnyArray, ArrayF32
 
 Device = Literal["cpu", "cuda"]
 
@@ -135,14 +135,14 @@ class OnnxModel:
         """True if `map` runs several items per call: on a GPU, if the first axis of all inputs is free."""
         return self.device == "cuda" and all(shape[:1] == (None,) for shape in self.inputs)
 
-    def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
+    def run(self, *tensors: AnyArray) -> list[ArrayF32]:
         """Return all outputs for the given inputs, both in the model's order. The method is thread-safe.
 
         Raises MemoryError if the memory is too small, and StageError if onnxruntime fails otherwise.
         """
         feeds = {info.name: tensor for info, tensor in zip(self._inputs, tensors, strict=True)}
         try:
-            outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
+            outputs: list[ArrayF32] = self._session.run(None, feeds)
         except Exception as error:  # onnxruntime's exceptions have no common base class
             _raise_exhausted(self.path, error)
             raise StageError(
@@ -152,10 +152,7 @@ class OnnxModel:
         return outputs
 
     def map(
-        self,
-        function: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-        items: Sequence[NDArray[np.float32]],
-        threads: int,
+        self, function: Callable[[ArrayF32], ArrayF32], items: Sequence[ArrayF32], threads: int
     ) -> Iterator[Any]:
         """Apply ``function`` to all items [H, W, C] of one size, and yield the results in their order.
 
@@ -169,9 +166,7 @@ class OnnxModel:
             yield from pool.map(lambda item: function(item[None])[0], items)
 
 
-def in_batches(
-    function: Callable[[NDArray[np.float32]], NDArray[np.float32]], items: Sequence[NDArray[np.float32]]
-) -> list[Any]:
+def in_batches(function: Callable[[ArrayF32], ArrayF32], items: Sequence[ArrayF32]) -> list[Any]:
     """Return the results of ``function`` for ``items`` [H, W, ...] of one size, computed in batches.
 
     The batch size is halved if a batch does not fit into the GPU's memory. StageError is raised if one item

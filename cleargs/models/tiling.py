@@ -13,10 +13,9 @@ from itertools import pairwise, product
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.types import AnyImage, ImageF32
+from cleargs.types import AnyImage, ArrayF32, ImageF32
 
 Sides: TypeAlias = tuple[int | None, int | None]
 """Height and width of the tiles; None: free."""
@@ -46,7 +45,7 @@ class TileAxis:
     """Side of the tiles, px."""
     starts: tuple[int, ...]
     """First pixel of each tile."""
-    windows: NDArray[np.float32]
+    windows: ArrayF32
     """Blend weights [tiles, size], which sum to 1 at each pixel."""
 
 
@@ -67,7 +66,7 @@ def plan_axis(length: int, fixed: int | None) -> TileAxis:
     return TileAxis(padded, size, starts, _blend_weights(padded, size, starts))
 
 
-def _blend_weights(padded: int, size: int, starts: tuple[int, ...]) -> NDArray[np.float32]:
+def _blend_weights(padded: int, size: int, starts: tuple[int, ...]) -> ArrayF32:
     """Return blend weights [tiles, size]: raised-cosine ramps in the overlaps, normalised to a sum of 1."""
     windows = np.ones((len(starts), size), np.float64)
     for k, (left, right) in enumerate(pairwise(starts)):

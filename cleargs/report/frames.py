@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import read_exposure
@@ -22,7 +21,7 @@ from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
 from cleargs.splat.camera import Camera
 from cleargs.splat.tables import TRAIN
-from cleargs.types import MaskBool
+from cleargs.types import ArrayF64, MaskBool
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles, on the page, of frames that RVA does not rate."""
@@ -62,7 +61,7 @@ class FrameRow:
     """The row of the frame in ``rva/frames.parquet``; empty without one."""
     rounds: tuple[Selection, ...] = ()
     """The rows of the frame in ``rivr/selection.parquet``, in the order of the rounds."""
-    affine: NDArray[np.float64] | None = None  # [3, 4]
+    affine: ArrayF64 | None = None  # [3, 4]
     """Transform of sRGB colours from the last scene to the frame; None without exposure compensation."""
     formation: Mapping[str, Any] = field(default_factory=dict)
     """Column of ``formation.parquet`` of the last scene -> value; empty without one."""
@@ -190,7 +189,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
         for found in sorted(read_selection(run / "rivr" / "selection.parquet"), key=lambda row: row.round):
             rounds.setdefault(found.frame_id, []).append(found)
     psnr = _last_psnr([run / stage / "train.parquet" for stage in SCENES if stage in stages])
-    affines: dict[int, NDArray[np.float64]] = {}
+    affines: dict[int, ArrayF64] = {}
     formation: dict[int, dict[str, Any]] = {}  # stays empty if image formation is off
     moving: dict[int, MaskBool] = {}
     if final := last_scene(stages):

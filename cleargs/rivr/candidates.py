@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cleargs.types import ImageF32
+from cleargs.types import ArrayF64, ImageF32
 
 CandidateName: TypeAlias = Literal["render", "restored", "fused"]
 Chosen: TypeAlias = Literal["render", "restored", "fused", "observed"]
@@ -46,7 +45,7 @@ def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
     return np.clip(render + detail, 0.0, 1.0).astype(np.float32)
 
 
-def gaussian_blur(image: ImageF32, sigma: float) -> NDArray[np.float64]:
+def gaussian_blur(image: ImageF32, sigma: float) -> ArrayF64:
     """Blur ``image`` [H, W, 3] by a Gaussian cut at 3 sigma, mirrored at the borders, in float64."""
     from scipy.ndimage import gaussian_filter
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
@@ -15,6 +14,7 @@ from cleargs.synth import phone
 from cleargs.synth.image_motion import SimulatedMotion, solve_duration
 from cleargs.synth.path import FPS
 from cleargs.synth.phone import auto_exposure
+from cleargs.types import ArrayF64
 
 REFERENCE_WIDTH = 640
 """Image width, px, for which lengths in pixels are stated."""
@@ -160,11 +160,11 @@ def _mixed(motions: Sequence[SimulatedMotion], scale: float, rng: np.random.Gene
 
 
 def noisy_poses(
-    poses: NDArray[np.float64],  # [F, 3, 4] camera to world
+    poses: ArrayF64,  # [F, 3, 4] camera to world
     protocol: Protocol,
     depth: float,
     seed: int,
-) -> NDArray[np.float64]:  # [F, 3, 4]
+) -> ArrayF64:  # [F, 3, 4]
     """Return the given poses: ``poses`` with the noise of ``protocol`` at this mean depth, world units."""
     rng = np.random.default_rng([seed, Stream.POSE_NOISE])
     turns = np.radians(protocol.rotation_noise) * rng.standard_normal((len(poses), 3))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.random_streams import Stream
+from cleargs.types import ArrayF32, ArrayF64
 
 BOX, SPHERE, ROD = 0, 1, 2
 
@@ -25,7 +26,7 @@ SURFACES, PRINTS = 8, 6
 """Number of material textures and of posters."""
 
 
-def _noise(rng: np.random.Generator, slope: float, stretch: float = 1.0) -> NDArray[np.float64]:
+def _noise(rng: np.random.Generator, slope: float, stretch: float = 1.0) -> ArrayF64:
     """Return periodic 1/f^slope noise of zero mean and unit variance, longer along x for ``stretch`` > 1."""
     frequency_y = np.fft.fftfreq(SIZE)[:, None]
     frequency_x = np.fft.rfftfreq(SIZE)[None, :] * stretch
@@ -36,13 +37,11 @@ def _noise(rng: np.random.Generator, slope: float, stretch: float = 1.0) -> NDAr
     return np.asarray(noise / noise.std(), np.float64)
 
 
-def _mix(
-    mask: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _mix(mask: ArrayF64, low: ArrayF64, high: ArrayF64) -> ArrayF64:
     return low + (high - low) * mask[..., None]
 
 
-def _surface(rng: np.random.Generator) -> NDArray[np.float64]:
+def _surface(rng: np.random.Generator) -> ArrayF64:
     """Return a texture like plaster, cloth or wood: two tones mixed by noise, grain and dark blotches."""
     base = rng.uniform(0.25, 0.75, 3)
     stretch = rng.choice([1.0, 1.0, 8.0])
@@ -53,7 +52,7 @@ def _surface(rng: np.random.Generator) -> NDArray[np.float64]:
     return texture * (1 + 0.12 * _noise(rng, 0.3)[..., None])
 
 
-def _print(rng: np.random.Generator) -> NDArray[np.float64]:
+def _print(rng: np.random.Generator) -> ArrayF64:
     """Return a poster: rectangles, discs, lines and letters on a tinted ground, wrapped at the edges."""
     canvas = np.empty((SIZE, SIZE, 3), np.uint8)
     canvas[:] = rng.integers(128, 240, 3)
@@ -79,7 +78,7 @@ def _print(rng: np.random.Generator) -> NDArray[np.float64]:
     return canvas / 255 * (1 + 0.05 * _noise(rng, 0.5)[..., None])
 
 
-def make_textures(rng: np.random.Generator) -> NDArray[np.float32]:  # [textures, texels of all levels, 3]
+def make_textures(rng: np.random.Generator) -> ArrayF32:  # [textures, texels of all levels, 3]
     """Return `SURFACES` materials, then `PRINTS` posters, with box-filtered mip levels, in linear RGB."""
     chains = []
     for image in [_surface(rng) for _ in range(SURFACES)] + [_print(rng) for _ in range(PRINTS)]:
@@ -111,9 +110,9 @@ class Room:
     """Room for the ray caster, in metres, with y up and the floor at y = 0."""
 
     primitives: NDArray[np.void]  # [P] of PRIMITIVE; the first is the room itself, seen from inside
-    textures: NDArray[np.float32]  # [T, texels of all levels, 3] linear RGB
-    light: NDArray[np.float64]  # [3] position of the lamp
-    focus: NDArray[np.float64]  # [3] target of the camera
+    textures: ArrayF32  # [T, texels of all levels, 3] linear RGB
+    light: ArrayF64  # [3] position of the lamp
+    focus: ArrayF64  # [3] target of the camera
 
 
 WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5

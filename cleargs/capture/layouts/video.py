@@ -13,10 +13,8 @@ from cleargs.capture.folders import folder_of_images, videos_in
 from cleargs.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from cleargs.media.video import Timeline
+    from cleargs.types import ArrayF64
 
 
 def detect(source: Path, *, poses: bool) -> bool:
@@ -113,7 +111,7 @@ def _notes(videos: Sequence[Path], timelines: Sequence[Timeline]) -> list[str]:
     return notes
 
 
-def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[int]:
+def _nearest(times: ArrayF64, wanted: ArrayF64) -> list[int]:
     """Numbers of the frames nearest to the wanted times, each once; ``times`` start at 0 and ascend."""
     import numpy as np
 
