@@ -282,8 +282,8 @@ def _evaluate(
         far=pooled(image.far for image in images),
         clipped=pooled(image.clipped for image in images),
         covered=mean_of(image.covered for image in images),
-        unavailable=dict(metrics.unavailable),
-        weights=dict(metrics.weights),
+        unavailable=metrics.unavailable,
+        weights=metrics.weights,
         versions={
             **versions(),
             **{name: version(name) for name in _LIBRARIES},

@@ -7,7 +7,7 @@ order, so the figures do not depend on the thread count.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -78,12 +78,12 @@ def _windowed(values: ArrayF64) -> ArrayF64:
 class MetricSet:
     """The metrics of an evaluation, ready to be asked from several threads at once."""
 
-    lpips: Mapping[str, Callable[[ImageF32, ImageF32], float]]
+    lpips: dict[str, Callable[[ImageF32, ImageF32], float]]
     """Metric -> distance of two float32 sRGB images."""
-    scorers: Mapping[str, Scorer]
-    weights: Mapping[str, str]
+    scorers: dict[str, Scorer]
+    weights: dict[str, str]
     """Metric -> digest of its weights."""
-    unavailable: Mapping[str, str]
+    unavailable: dict[str, str]
     """Metric -> reason why it is unavailable."""
 
     def measure(self, image: ImageU8, reference: ImageU8, mask: MaskBool | None) -> dict[str, float | None]:
@@ -105,24 +105,21 @@ def load_metrics(options: EvalOptions) -> MetricSet:
 
     Raises InputError for a scorer of an unknown name or an unusable file.
     """
-    lpips: dict[str, Callable[[ImageF32, ImageF32], float]] = {}
-    scorers: dict[str, Scorer] = {}
-    weights: dict[str, str] = {}
-    unavailable: dict[str, str] = {}
+    found = MetricSet({}, {}, {}, {})
     for net in options.lpips:
         file = model_dir() / weights_file(net)
         if file.is_file():
-            lpips[f"lpips_{net}"] = load_lpips(net).distance
-            weights[f"lpips_{net}"] = file_digest(file)
+            found.lpips[f"lpips_{net}"] = load_lpips(net).distance
+            found.weights[f"lpips_{net}"] = file_digest(file)
         else:
-            unavailable[f"lpips_{net}"] = "not installed: run `cleargs models install lpips` once"
+            found.unavailable[f"lpips_{net}"] = "not installed: run `cleargs models install lpips` once"
     for name in options.scorers:
         if name in INSTALLABLE and not (model_dir() / f"{name}.onnx").is_file():
-            unavailable[name] = "not installed: see `cleargs models list`"
+            found.unavailable[name] = "not installed: see `cleargs models list`"
         else:
-            scorers[name] = load_scorer(name)
-            weights[name] = scorers[name].digest
-    return MetricSet(lpips, scorers, weights, unavailable)
+            found.scorers[name] = load_scorer(name)
+            found.weights[name] = found.scorers[name].digest
+    return found
 
 
 def fit_affine(image: ArrayF64, reference: ArrayF64, mask: MaskBool | None) -> ArrayF64:  # [3, 4]
