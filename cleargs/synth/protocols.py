@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cleargs.errors import InputError
 from cleargs.random_streams import Stream
 from cleargs.synth import phone
 from cleargs.synth.image_motion import SimulatedMotion, solve_duration
@@ -81,13 +80,6 @@ PROTOCOLS: dict[str, Protocol] = {
     "moving": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True, moving=1),
     "moving-severe": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True, moving=2),
 }
-
-
-def find_protocol(name: str) -> Protocol:
-    """Return the protocol called ``name``. Raise InputError if there is none."""
-    if name not in PROTOCOLS:
-        raise InputError(f"no protocol is called {name!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[name]
 
 
 @dataclass(frozen=True)

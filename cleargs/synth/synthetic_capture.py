@@ -31,7 +31,7 @@ from cleargs.synth.phone import (
     metered_luminance,
     phone_look,
 )
-from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan_faults
+from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, Fault, noisy_poses, plan_faults
 from cleargs.synth.raycast import room_setup
 from cleargs.types import ArrayF64
 
@@ -117,7 +117,9 @@ def make_capture(
         cg.make_capture("small", "gs2e-medium", frames=4, width=96, height=64)
     """
     out, reporter = Path(out), reporter or log_reporter()
-    rules = find_protocol(protocol)
+    rules = PROTOCOLS.get(protocol)
+    if rules is None:
+        raise InputError(f"no protocol is called {protocol!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")
     if video or rules.phone:
