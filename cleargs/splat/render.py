@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,4 @@ class Viewer:
 
     def render(self, camera: Camera, background: tuple[float, float, float], depth: bool = False) -> Render:
         """Render image, alpha and, if ``depth`` is set, accumulated depth over ``background`` (sRGB)."""
-        scene = self._scene
-        return self._engine.forward(
-            scene.gaussians, camera, background=background, antialias=scene.antialias, depth=depth
-        )
+        return self._engine.view(replace(self._scene, background=background), camera, depth=depth)
