@@ -19,18 +19,10 @@ from cleargs.media.image import write_rgb
 from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter, log_reporter
 from cleargs.random_streams import Stream
+from cleargs.synth import phone
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
 from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, distorted, instant_shutter
 from cleargs.synth.path import FPS, SHOT_SECONDS, HandheldPath, SceneSetup, frame_times
-from cleargs.synth.phone import (
-    BITS_PER_PIXEL,
-    PLAIN,
-    Look,
-    develop,
-    encode_and_decode,
-    metered_luminance,
-    phone_look,
-)
 from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, Fault, noisy_poses, plan_faults
 from cleargs.synth.raycast import room_setup
 from cleargs.types import ArrayF64
@@ -126,12 +118,12 @@ def make_capture(
         require_even(width, height)
     rate = 1 / SHOT_SECONDS if rules.shots else FPS
     setup = setup or room_setup(frames, width, height, seed, rules.moving)
-    look = phone_look(seed) if rules.phone else PLAIN
+    look = phone.phone_look(seed) if rules.phone else phone.PLAIN
     processing = {
         "tone_contrast": look.contrast,
         "tone_pivot": look.pivot,
         "sharpening": look.sharpening,
-        "codec_bits_per_pixel": BITS_PER_PIXEL if rules.phone else 0.0,
+        "codec_bits_per_pixel": phone.BITS_PER_PIXEL if rules.phone else 0.0,
     }
     if not rules.phone:
         setup = replace(setup, film=None)
@@ -148,7 +140,7 @@ def make_capture(
             (out / "truth" / folder).mkdir(parents=True)
         for stem, time, pose in zip(stems, times, poses, strict=True):
             light, depth = _write_sharp(out / "truth" / "observed", stem, setup, pose, look)
-            luminances.append(metered_luminance(light))
+            luminances.append(phone.metered_luminance(light))
             motions.append(track_motion(path, float(time), depth, setup.lens))
             seen = depth[depth > 0]
             depths.append(float(seen.mean()))
@@ -164,7 +156,7 @@ def make_capture(
             light, seen = _expose(setup, motion, fault, nearness, rng)
             if any(rules.distortion):
                 light = distorted(light, setup.lens, rules.distortion)
-            shots.append(develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
+            shots.append(phone.develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
             moving = {"moving_share": float((seen > 0).mean())}
             rows.append(_row(number, images[number], motion, fault, rate) | processing | moving)
             if setup.film is not None:
@@ -172,7 +164,7 @@ def make_capture(
                 write_rgb(out / "truth" / "moving" / f"{stems[number]}.png", mask)
             task.advance()
         if rules.phone:
-            shots = encode_and_decode(out / "capture.mp4", shots, rate)
+            shots = phone.encode_and_decode(out / "capture.mp4", shots, rate)
         for image, shot in zip(images, shots, strict=True):
             write_rgb(out / image, shot, quality=rules.jpeg)
         for stem, pose in zip(novel_stems, novel, strict=True):
@@ -241,11 +233,11 @@ def _expose(
 
 
 def _write_sharp(
-    folder: Path, stem: str, setup: SceneSetup, pose: ArrayF64, look: Look
+    folder: Path, stem: str, setup: SceneSetup, pose: ArrayF64, look: phone.Look
 ) -> tuple[ArrayF64, ArrayF64]:
     """Write a sharp view and its depth. Return its linear light [H, W, 3] and camera z [H, W]."""
     light = setup.world.render(instant_shutter(pose, setup.lens.height), setup.lens)
-    write_rgb(folder / "images" / f"{stem}.png", develop(light, look=look))
+    write_rgb(folder / "images" / f"{stem}.png", phone.develop(light, look=look))
     depth = setup.world.depth(pose, setup.lens)
     write_depth(folder / "depth" / f"{stem}.exr", depth)
     return light, depth
