@@ -221,8 +221,7 @@ def read_row(out: Path, exr: str) -> Selection | None:
         values = {name.removeprefix(PREFIX): value for name, value in attributes.items()}
         frame_id, accepted = values.pop("frame"), bool(values.pop("accepted"))
         absent: dict[str, Any] = dict.fromkeys(_OPTIONAL)
-        found = Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(absent | values))
-        return None if found.primary_render is None else found
+        return Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(absent | values))
     except (StoreError, KeyError, TypeError):
         return None
 
