@@ -17,19 +17,9 @@ import torch
 from cleargs.capture.folders import image_files
 from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
+from cleargs.evaluate import metrics
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_of, split_hash
-from cleargs.evaluate.metrics import (
-    apply_affine,
-    clipped_pixels,
-    depth_of_points,
-    far_pixels,
-    fit_affine,
-    load_metrics,
-    pooled,
-    psnr,
-    region,
-)
 from cleargs.evaluate.references import Reference, ReferenceView, matching
 from cleargs.evaluate.refinement import refine_pose
 from cleargs.files import disk_errors
@@ -164,9 +154,9 @@ def _renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None) -> Predi
             camera, refinement = refine_pose(
                 lambda camera: render(camera)[0], camera, distance, target, mask, refine_steps
             )
-        farthest = None if points is None else depth_of_points(points, camera)
+        farthest = None if points is None else metrics.depth_of_points(points, camera)
         if farthest is not None:
-            far = far_pixels(*depth_and_alpha(camera), farthest)
+            far = metrics.far_pixels(*depth_and_alpha(camera), farthest)
         covered = None
         if view.depth is not None:
             surface = read_depth(view.depth)
@@ -216,19 +206,19 @@ def _evaluate(
     save: Path | None,
 ) -> Evaluation:
     """Predictions are made one after the other (a render uses all threads) and measured in parallel."""
-    metrics = load_metrics(options)
+    measures = metrics.load_metrics(options)
     if save is not None:
         with disk_errors(save):
             save.mkdir(parents=True, exist_ok=True)
 
     def measured(name: str, prediction: _Prediction, target: ImageU8, mask: MaskBool | None) -> ImageResult:
         image, affine, aligned_psnr = prediction.image, None, None
-        fitted = fit_affine(image, target / 255.0, mask)
-        aligned = apply_affine(image, fitted)
+        fitted = metrics.fit_affine(image, target / 255.0, mask)
+        aligned = metrics.apply_affine(image, fitted)
         if options.align_colour:
             image, affine = aligned, fitted
         else:
-            aligned_psnr = psnr(to_uint8(aligned), target, mask)
+            aligned_psnr = metrics.psnr(to_uint8(aligned), target, mask)
         pixels, white = to_uint8(image), prediction.over_white
         if save is not None:
             write_rgb(save / f"{name}.png", pixels)
@@ -236,18 +226,18 @@ def _evaluate(
             name=name,
             width=pixels.shape[1],
             height=pixels.shape[0],
-            values=metrics.measure(pixels, target, mask),
+            values=measures.measure(pixels, target, mask),
             prediction=_digest(pixels),
             reference=_digest(target, mask),
             colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
             psnr_colour_aligned=aligned_psnr,
-            psnr_white=None if white is None else psnr(to_uint8(white), target, mask),
+            psnr_white=None if white is None else metrics.psnr(to_uint8(white), target, mask),
             psnr_between=None
             if white is None
             else decibels(float(np.square(white - prediction.image).sum()), white.size),
             refinement=prediction.refinement,
-            far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
-            clipped=region(pixels, target, clipped_pixels(target), mask),
+            far=None if prediction.far is None else metrics.region(pixels, target, prediction.far, mask),
+            clipped=metrics.region(pixels, target, metrics.clipped_pixels(target), mask),
             covered=prediction.covered,
         )
 
@@ -279,11 +269,11 @@ def _evaluate(
         psnr_colour_aligned=mean_of(image.psnr_colour_aligned for image in images),
         psnr_white=mean_of(image.psnr_white for image in images),
         psnr_between=mean_of(image.psnr_between for image in images),
-        far=pooled(image.far for image in images),
-        clipped=pooled(image.clipped for image in images),
+        far=metrics.pooled(image.far for image in images),
+        clipped=metrics.pooled(image.clipped for image in images),
         covered=mean_of(image.covered for image in images),
-        unavailable=metrics.unavailable,
-        weights=metrics.weights,
+        unavailable=measures.unavailable,
+        weights=measures.weights,
         versions={
             **versions(),
             **{name: version(name) for name in _LIBRARIES},
