@@ -87,16 +87,9 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Distil the latest accepted repairs from RIVR's scene and check for harm."""
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
+    from cleargs.rivr import tables
     from cleargs.rivr.distillation import TrainedScene, check_harm, publish
     from cleargs.rivr.rounds import pseudo_view
-    from cleargs.rivr.tables import (
-        chosen_counts,
-        kept_raw,
-        latest_accepted,
-        read_selection,
-        repaired_share,
-        write_repairs,
-    )
     from cleargs.rivr.targets import load_supervision
     from cleargs.splat.backend import set_threads
 
@@ -107,10 +100,10 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     if context.settings["g0"].quality == "draft":
         return _unchanged(context)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
-    rows = read_selection(rivr / "selection.parquet")
-    repairs, kept = latest_accepted(rows), kept_raw(rows)
+    rows = tables.read_selection(rivr / "selection.parquet")
+    repairs, kept = tables.latest_accepted(rows), tables.kept_raw(rows)
     unrepaired = kept.intersection(row.frame_id for row in rows if row.exr is not None)
-    write_repairs(context.out / "repairs.parquet", repairs)
+    tables.write_repairs(context.out / "repairs.parquet", repairs)
 
     g0 = TrainedScene(context.inputs["g0"], context.device)
     start = TrainedScene(rivr, context.device) if repairs or kept else g0
@@ -126,7 +119,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             round=0,
             pseudo_share=config.distil.pseudo_share,
             pseudo_weight=config.distil.pseudo_weight,
-            repaired=repaired_share(rows),
+            repaired=tables.repaired_share(rows),
             reporter=reporter,
         )
         trainings.append(consolidated.folder)
@@ -145,7 +138,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     return StageResult(
         summary={
             "repairs": len(repairs),
-            "chosen": chosen_counts(repairs) | {"observed": len(unrepaired)},
+            "chosen": tables.chosen_counts(repairs) | {"observed": len(unrepaired)},
             "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
             "scorer": scorer.name,
             "held_back": asdict(verdict),
