@@ -7,10 +7,8 @@ the screen as it is between its flickers.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.random_streams import Stream
 from cleargs.synth.room import BOX, PRINTS, SPHERE, SURFACES, Room, primitive
@@ -28,18 +26,6 @@ FLICKERS_PER_SECOND, FLICKER_STOPS = 12.0, 1.5
 """Changes of the screen's brightness, and the largest change in stops."""
 
 
-class Movers(Protocol):
-    """Primitives that move or change."""
-
-    items: NDArray[np.void]
-    """[M] of `cleargs.synth.room.PRIMITIVE`."""
-    resting: int
-    """Number of the first of them that are also the last of the room, at rest."""
-
-    def states(self, times: ArrayF64) -> ArrayF64:
-        """Return the centres and the brightness [..., M, 4] at ``times`` [...], seconds; 1: as lit."""
-
-
 class Balloon:
     """A ball that moves back and forth above the table of a room.
 
@@ -47,16 +33,19 @@ class Balloon:
     """
 
     resting = 0
+    """Number of the first items that are also the last of the room, at rest."""
 
     def __init__(self, room: Room, seed: int) -> None:
         rng = np.random.default_rng([seed, Stream.BALLOON])
         centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
         texture = SURFACES + int(rng.integers(PRINTS))
         self.items = np.array([primitive(SPHERE, centre, (0.11, 0, 0), texture, gloss=0.5)])
+        """What moves or changes, [M] of `cleargs.synth.room.PRIMITIVE`."""
         self._rates = 2 * np.pi / rng.uniform(4, 6, 3)  # radians per second
         self._phases = rng.uniform(0, 2 * np.pi, 3)
 
     def states(self, times: ArrayF64) -> ArrayF64:
+        """Return the centres and the brightness [..., M, 4] at ``times`` [...], seconds; 1: as lit."""
         centres = self.items[0]["centre"] + SWAY * np.sin(self._rates * times[..., None] + self._phases)
         return np.concatenate([centres, np.ones((*times.shape, 1))], -1)[..., None, :]
 
@@ -119,7 +108,7 @@ class Household:
         self._stops = rng.uniform(0.5, 1.0, 4096) * rng.choice([-1.0, 1.0], 4096) * FLICKER_STOPS
 
     def states(self, times: ArrayF64) -> ArrayF64:
-        """See `Movers`. The last of the items belong to the person."""
+        """See `Balloon.states`. The last of the items belong to the person."""
         shares = times / self._duration
         states = np.ones((*times.shape, len(self.items), 4))
         states[..., :3] = self.items["centre"]

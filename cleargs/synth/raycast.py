@@ -16,7 +16,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
-from cleargs.synth.movers import SEVERITIES, Balloon, Household, Movers
+from cleargs.synth.movers import SEVERITIES, Balloon, Household
 from cleargs.synth.optics import PINHOLE, Aperture, Lens, Shutter, low_discrepancy, phone_lens
 from cleargs.synth.path import FPS, Orbit, SceneSetup
 from cleargs.synth.room import BOX, LEVEL_STARTS, LEVELS, SIZE, SPHERE, TEXELS_PER_METRE, Room, make_room
@@ -351,7 +351,7 @@ class RoomWorld:
         return self._expose(shutter, lens, aperture)[0]
 
     def film(
-        self, movers: Movers, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
+        self, movers: Balloon | Household, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
     ) -> tuple[ArrayF64, ArrayF64]:
         """Render the room with what moves in it during the exposure.
 
@@ -367,7 +367,7 @@ class RoomWorld:
         return self._expose(middle, lens, PINHOLE)[1]
 
     def _expose(
-        self, shutter: Shutter, lens: Lens, aperture: Aperture, movers: Movers | None = None
+        self, shutter: Shutter, lens: Lens, aperture: Aperture, movers: Balloon | Household | None = None
     ) -> tuple[ArrayF64, ArrayF64, ArrayF64]:
         """Return image, depth, and the share of the samples that see movement; see `_render`."""
         primitives, states = self.room.primitives, np.empty((0, 0, 0, 4))
@@ -392,7 +392,7 @@ def room_setup(frames: int, width: int, height: int, seed: int, moving: int = 0)
     ``moving`` is a key of `SEVERITIES`; 0: a balloon.
     """
     room = make_room(seed)
-    movers: Movers = Balloon(room, seed)
+    movers: Balloon | Household = Balloon(room, seed)
     if moving:
         movers = household = Household(room, frames / FPS, seed, SEVERITIES[moving])
         room = household.room
