@@ -23,7 +23,7 @@ def check_evaluator(config: EvaluatorConfig) -> None:
     Raises InputError if the plugin cannot be loaded, or the server does not answer or lacks the model.
     """
     if config.evaluator == "qwen3-vl":
-        _qwen(config.qwen).check()
+        _qwen(config.qwen).server.check()
     elif config.evaluator not in EVALUATORS:
         load_plugin("evaluators", config.evaluator)
 

@@ -40,14 +40,10 @@ class QwenEvaluator:
         """
         self.name = f"qwen3-vl:{config.model}:prompt"
         self._config = config
-        self._server = QwenServer(config, seed=seed)
+        self.server = QwenServer(config, seed=seed)
         identity = json.dumps(["server", config.model, config.max_tokens, seed])
         facts = [identity, self.version, _LONG_SIDE]
         self._cache = ItemCache(cache, CUE_COLUMNS, facts, bounds=(0.0, 1.0))
-
-    def check(self) -> None:
-        """Raise InputError if the model is unavailable; see `QwenServer.check`."""
-        self._server.check()
 
     def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
         """Score all frames; see `Evaluator.evaluate`. ``threads`` is not used.
@@ -67,7 +63,7 @@ class QwenEvaluator:
                         faults[rows[future]] = str(fault)
                     task.advance()
         except BaseException:
-            self._server.stop()
+            self.server.stop()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         pool.shutdown()
@@ -85,4 +81,4 @@ class QwenEvaluator:
         if mask is not None:
             rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
         masked = mask is not None and not mask.all()
-        return self._server.score(reduced(rgb, _LONG_SIDE), masked=masked)
+        return self.server.score(reduced(rgb, _LONG_SIDE), masked=masked)
