@@ -33,7 +33,7 @@ MIN_TIMED_FRAMES, UNEVEN = 8, 2.0
 """Fewest frames with a speed that tell the readout time, and the factor from the median gap between frames to
 the shortest and the longest one at a frame with a speed. In a shorter gap an error of a pose weighs more."""
 MIN_CORRELATION = 0.4
-"""Least correlation of skews and speeds from which the slope is taken for the readout time."""
+"""Least correlation of skews and speeds from which the slope gives the readout time."""
 WITH_SKEW: dict[Model, Model] = {"none": "skew", "blur": "both", "skew": "skew", "both": "both"}
 """Model of a frame to which a skew is added. A defocused frame keeps its model."""
 

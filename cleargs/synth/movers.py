@@ -40,7 +40,7 @@ class Balloon:
         centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
         texture = SURFACES + int(rng.integers(PRINTS))
         self.items = np.array([primitive(SPHERE, centre, (0.11, 0, 0), texture, gloss=0.5)])
-        """What moves or changes, [M] of `cleargs.synth.room.PRIMITIVE`."""
+        """Things that move or change, [M] of `cleargs.synth.room.PRIMITIVE`."""
         self._rates = 2 * np.pi / rng.uniform(4, 6, 3)  # radians per second
         self._phases = rng.uniform(0, 2 * np.pi, 3)
 

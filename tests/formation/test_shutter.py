@@ -18,7 +18,7 @@ from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64
 
 FRAMES, INTERVAL, READOUT, FOCAL, DEPTH = 16, 0.2, 0.05, 250.0, 2.0
-NEEDED = np.array([-4.0, 0.5, 0.0, 0.5, 4.0, 0.5])  # what the scene has taken up, px
+NEEDED = np.array([-4.0, 0.5, 0.0, 0.5, 4.0, 0.5])  # the part of the skews that the scene has taken up, px
 REST = np.array([DEPTH] * 3 + [1.0] * 3)  # from px to world units times the focal length
 
 
