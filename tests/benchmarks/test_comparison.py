@@ -26,7 +26,7 @@ from benchmarks.comparison.scenes import (
 from cleargs.capture.tables import load_frames
 from cleargs.cli.common import DONE_IN_PART
 from cleargs.errors import InputError
-from cleargs.evaluate import evaluate, metrics
+from cleargs.evaluate import metrics
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
@@ -274,7 +274,6 @@ def test_metric_is_measured_once_its_weights_exist(
     whole = metrics.load_metrics(options)
     bare = replace(whole, scorers={}, weights={}, unavailable={"clarity-net": "not installed"})
     monkeypatch.setattr(metrics, "load_metrics", lambda options: bare)
-    monkeypatch.setattr(evaluate, "load_metrics", lambda options: bare)
     assert kept_weights() == {}
     monkeypatch.undo()
     assert kept_weights() == whole.weights
