@@ -115,6 +115,7 @@ class _Sfm(Features):
         else:
             model, placed = self._mapped(pairs)
             if job.config.camera_model == "auto":
+                self._report(phase="measuring the lens", total=None)
                 model = Adjuster(self._matched, self._with_points).with_measured_lens(model)
             outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model), torn_at=self._torn_at)
         make_folder(self._output, empty=True)
@@ -260,13 +261,21 @@ class _Sfm(Features):
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         self._report(phase="reconstructing", total=total)
         registered = count(3)  # after the first pair
+
+        def placed() -> None:
+            number = next(registered)
+            if number < total:
+                self._report(done=number)
+            elif number == total:
+                self._report(phase="adjusting all poses", total=None)
+
         models = pycolmap.incremental_mapping(
             self._database,
             self._job.images,
             self._output,
             options,
             initial_image_pair_callback=lambda: self._report(done=2),
-            next_image_callback=lambda: self._report(done=min(next(registered), total)),
+            next_image_callback=placed,
         )
         if not models:
             raise StageError(
