@@ -110,6 +110,13 @@ def flow_basis(
     return basis
 
 
+def grid_basis(camera: Camera, shape: tuple[int, int]) -> ArrayF64:
+    """Return `flow_basis` at the median depth and the centres of a grid, [6, 2, rows, columns] px."""
+    basis = flow_basis(camera, np.ones(shape, np.float32)).astype(np.float64)
+    basis *= np.array([camera.width / shape[1], camera.height / shape[0]])[:, None, None]
+    return basis
+
+
 def pixel_paths(
     motion: FrameMotion, camera: Camera, shape: tuple[int, int], times: ArrayF64
 ) -> ArrayF64:  # [T, rows, columns, 2] px
@@ -118,8 +125,7 @@ def pixel_paths(
     They are those at the median depth, relative to the mean of the exposure. ``shape`` are rows and columns
     of the grid. Times are from -1/2 to 1/2.
     """
-    basis = flow_basis(camera, np.ones(shape, np.float32)).astype(np.float64)
-    basis *= np.array([camera.width / shape[1], camera.height / shape[0]])[:, None, None]
+    basis = grid_basis(camera, shape)
     orders = np.stack([times, times**2 - 1 / 12, times**3 - 3 * times / 20])
     twists = np.stack([motion.blur, motion.bend, motion.cube])
     return np.asarray(np.einsum("ot,on,ncij->tijc", orders, twists, basis))

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from cleargs.formation.frame import FrameFormation
-from cleargs.formation.motion import Model, flow_basis
+from cleargs.formation.motion import Model, grid_basis
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64
@@ -121,9 +121,5 @@ def _scale(median_depth: float) -> ArrayF64:  # [6]
 
 def _image_motion(camera: Camera) -> ArrayF64:  # [6, 6]
     """Return the matrix of the mean squared image motion of a twist at the median depth, px."""
-    rows, columns = 9, 16
-    basis = flow_basis(camera, np.ones((rows, columns), np.float32)).astype(np.float64)
-    basis *= np.array([camera.width / columns, camera.height / rows])[:, None, None]
-    flat = basis.reshape(len(basis), -1)
-    matrix: ArrayF64 = flat @ flat.T / (rows * columns)
-    return matrix
+    basis = grid_basis(camera, (9, 16))
+    return np.asarray(np.einsum("icyx,jcyx->ij", basis, basis) / basis[0, 0].size)
