@@ -33,7 +33,8 @@ MIN_TIMED_FRAMES, UNEVEN = 8, 2.0
 """Fewest frames with a speed that tell the readout time, and the factor from the median gap between frames to
 the shortest and the longest one at a frame with a speed. In a shorter gap an error of a pose weighs more."""
 MIN_CORRELATION = 0.4
-"""Least correlation of skews and speeds from which the slope gives the readout time."""
+"""Least correlation of skews and speeds from which the slope gives the readout time. Source: measurements in
+docs/experiments/formation.md."""
 WITH_SKEW: dict[Model, Model] = {"none": "skew", "blur": "both", "skew": "skew", "both": "both"}
 """Model of a frame to which a skew is added. A defocused frame keeps its model."""
 
@@ -63,6 +64,8 @@ class CameraSpeeds:
     the focal length in px. It is that of a cubic spline through the poses."""
     metric: ArrayF64  # [6, 6]
     """Matrix of the squared image motion of a twist in px, its mean over the image."""
+    interval: float
+    """Median time between frames. No readout takes longer."""
 
     @classmethod
     def of(cls, views: Sequence[TrainingView]) -> CameraSpeeds | None:
@@ -76,17 +79,18 @@ class CameraSpeeds:
         turns = 0.5 * (rates - rates.transpose(0, 2, 1))
         focal = np.array([view.camera.fx for view in views])
         twists = np.column_stack([rates[:, :3, 3], turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]])
-        even = np.abs(np.log(gaps / np.median(gaps))) <= math.log(UNEVEN)
+        interval = float(np.median(gaps))
+        even = np.abs(np.log(gaps / interval)) <= math.log(UNEVEN)
         inner = zip(views[1:-1], focal[1:-1], twists[1:-1], even[:-1] & even[1:], strict=True)
         per_frame = {view.frame_id: scale * twist for view, scale, twist, timed in inner if timed}
-        return cls(per_frame, _image_motion(views[0].camera))
+        return cls(per_frame, _image_motion(views[0].camera), interval)
 
     def missing_skew(self, frames: Mapping[int, FrameFormation]) -> ArrayF64 | None:
         """Return what the skews of all ``frames`` lack in common, a twist [6] as in `per_frame`.
 
-        None where the skews do not follow the speeds.
+        None where the skews do not follow the speeds, or the speeds vary too little to tell.
         """
-        ids = [k for k in self.per_frame if k in frames and frames[k].model in WITH_SKEW]
+        ids = [k for k in self.per_frame if frames[k].model in WITH_SKEW]
         if len(ids) < MIN_TIMED_FRAMES:
             return None
         scales = np.stack([_scale(frames[k].motion.median_depth) for k in ids])
@@ -97,6 +101,8 @@ class CameraSpeeds:
         if common <= MIN_CORRELATION * math.sqrt(self._product(varying, varying) * spread):
             return None
         readout = common / spread
+        if readout > self.interval:
+            return None
         missing: ArrayF64 = ((readout * speeds - skews) * scales).mean(axis=0)
         return missing
 
