@@ -25,8 +25,7 @@ def name_program() -> None:
     if found is not None and (Path(found) == script or Path(found) == Path(sys.argv[0]).absolute()):
         os.environ[PROGRAM] = "cleargs"
     else:
-        words = [str(script)] if script.is_file() else module_command("cleargs")
-        os.environ[PROGRAM] = shlex.join(words)
+        os.environ[PROGRAM] = shlex.join([str(script)] if script.is_file() else module_command("cleargs"))
 
 
 def program(folder: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 from urllib.parse import quote
@@ -79,14 +80,12 @@ def _picture(
 ) -> tuple[ImageFile | None, str]:
     """Return a picture, and a label for it: the still of the scene's report, or else the first frame."""
     still = run / FOLDER / "scene.jpg"
-    try:
+    with suppress(CleargsError):  # a damaged picture must not hide the scene
         if still.is_file():
             return write_jpeg(report, name, read_rgb(still), side), "the scene"
         if "ingest" in made:
             first = load_frames(run / "ingest")[0].image
             return write_jpeg(report, name, read_rgb(run / "ingest" / first), side), "the first frame"
-    except CleargsError:  # a damaged picture must not hide the scene
-        pass
     return None, ""
 
 

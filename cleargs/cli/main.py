@@ -103,10 +103,9 @@ def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program
     from cleargs.cli.terminal import handle_signals, protect_streams
 
     protect_streams()
-    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         handle_signals()
-        code = invoke(given, dag, program)
+        code = invoke(list(sys.argv[1:] if arguments is None else arguments), dag, program)
     except KeyboardInterrupt:  # before the command began, or after it ended
         code = _interrupted()
     if code == INTERRUPTED:

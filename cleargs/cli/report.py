@@ -69,9 +69,8 @@ def report(
     from cleargs.report.single_file import write_single_file
 
     settings = read_run_file(run, dag, store=store)
-    reporter = make_reporter(quiet)
     with opened_store(settings.store) as opened:
-        page = write_report(Planner(dag, settings, opened, threads, reporter))
+        page = write_report(Planner(dag, settings, opened, threads, make_reporter(quiet)))
     address = (settings.folder / ENTRY).as_uri()
     facts: dict[str, Any] = {"report": str(page)}
     lines = [f"report: {address}"]

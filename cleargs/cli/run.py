@@ -270,8 +270,7 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
     """Show for each stage of RUN if it is done, partial or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
     with opened_store(settings.store) as opened:
-        planner = Planner(dag, settings, opened, usable_cores(), make_reporter())
-        print_plans(planner.plan(), as_json)
+        print_plans(Planner(dag, settings, opened, usable_cores(), make_reporter()).plan(), as_json)
 
 
 def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:

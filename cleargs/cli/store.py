@@ -60,8 +60,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
                 faults.append(StoreFault("damaged", name, text))
                 continue
             files += len(manifest.files)
-            place = folder.resolve()
-            lines = damages(place, manifest, manifest.files, opened.memo, rehash=True)
+            lines = damages(folder.resolve(), manifest, manifest.files, opened.memo, rehash=True)
             faults += [StoreFault("damaged", name, line) for line in lines]
             faults += _changed_inputs(dag, settings, opened, manifest)
     if not stages:

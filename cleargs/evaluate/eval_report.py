@@ -246,7 +246,6 @@ def _row(evaluation: Evaluation, image: ImageResult) -> dict[str, Any]:
         **image.values,
         "colour": None if image.colour is None else [x for line in image.colour for x in line],
     }
-    parts = {"far": image.far, "clipped": image.clipped, "refined": image.refinement}
-    for name, part in parts.items():
+    for name, part in {"far": image.far, "clipped": image.clipped, "refined": image.refinement}.items():
         row |= {f"{name}_{figure}": value for figure, value in part or ()}
     return row

@@ -119,8 +119,7 @@ def evaluate_images(
         return _Prediction(image / 255.0)
 
     restricted = replace(reference, views=matched)
-    name = folder.resolve().name
-    found = _evaluate(name, None, predict, restricted, options, threads, reporter, save)
+    found = _evaluate(folder.resolve().name, None, predict, restricted, options, threads, reporter, save)
     if len(matched) < len(reference.views):
         reporter.warn(
             f"{folder} has images for {len(matched)} of {len(reference.views)} references: "

@@ -18,7 +18,6 @@ from pydantic import BaseModel, ValidationError
 from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import Setting, flattened, settings_of, suggestion
-from cleargs.pipeline.stage import Stage
 from cleargs.safe_io import FAULTS, faults_as, read_text
 
 RECIPES = "cleargs.workflows"
@@ -150,7 +149,11 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
             sections[name] = model.model_validate(document.get(name, {}))
         except ValidationError as error:
             raise _setting_error(name, models, error) from error
-    return Config(seed, sections, {name: _effective(dag.load(name), name, sections) for name in sections})
+    effective: dict[str, BaseModel] = {}
+    for name, config in sections.items():
+        change = getattr(dag.load(name), "effective", None)
+        effective[name] = config if change is None else change(config, sections)
+    return Config(seed, sections, effective)
 
 
 def known_settings(dag: Dag, document: Mapping[str, Any]) -> tuple[Document, list[str]]:
@@ -177,11 +180,6 @@ def _known(table: Any, model: Any, place: str, others: list[str]) -> Any:
         for name, field in model.model_fields.items()
         if name in table
     }
-
-
-def _effective(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> BaseModel:
-    changed: BaseModel = getattr(stage, "effective", lambda config, others: config)(sections[name], sections)
-    return changed
 
 
 def _setting_error(

@@ -123,8 +123,7 @@ def read_metadata(folder: Path) -> RunMetadata:
     on_cpu = document.pop("on_cpu", [])
     if not isinstance(on_cpu, list) or not all(isinstance(name, str) for name in on_cpu):
         on_cpu, damaged = [], True
-    source, store = paths.get("input"), paths.get("store")
-    return RunMetadata(document, source, store, device, tuple(on_cpu), damaged)
+    return RunMetadata(document, paths.get("input"), paths.get("store"), device, tuple(on_cpu), damaged)
 
 
 def read_source(folder: Path) -> Path | None:

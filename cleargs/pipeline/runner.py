@@ -226,13 +226,12 @@ class Runner(Planner):
             raise StageError(
                 f"the input changed while {name} was reading it", hint="give the same command again"
             )
-        if not result.missing:
-            absent = [output for output in stage.OUTPUTS if not (work.out / output).exists()]
-            if absent:
-                raise StageError(
-                    f"{name} ended without its outputs {', '.join(absent)}",
-                    hint=f"this is a bug in the stage; please report it with {self.run.folder / RUN_FILE}",
-                )
+        absent = [output for output in stage.OUTPUTS if not (work.out / output).exists()]
+        if absent and not result.missing:
+            raise StageError(
+                f"{name} ended without its outputs {', '.join(absent)}",
+                hint=f"this is a bug in the stage; please report it with {self.run.folder / RUN_FILE}",
+            )
         files = {
             name: FileRecord(size=file.stat().st_size, digest=file_digest(file))
             for name, file in published_files(work.out).items()

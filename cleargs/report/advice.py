@@ -127,8 +127,7 @@ def _time(planner: Planner, options: Sequence[str]) -> str:
     ]
     kept = "default" if "--reset" in options else planner.run.config.document()
     try:
-        config = load_config(planner.dag, kept, given)
-        run = replace(planner.run, config=config)
+        run = replace(planner.run, config=load_config(planner.dag, kept, given))
         changed = Planner(planner.dag, run, planner.store, planner.threads, SilentReporter())
         costs = [plan.estimate.minutes for plan in changed.plan() if plan.estimate is not None]
     except CleargsError:  # the capture was deleted or moved

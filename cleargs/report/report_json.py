@@ -41,8 +41,7 @@ def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
 
 
 def write_report_json(folder: Path, manifests: Mapping[str, Manifest]) -> None:
-    content = {"made_from": _made_from(manifests), "cameras": cameras_of(manifests)}
-    write_json(folder / REPORT_JSON, content)
+    write_json(folder / REPORT_JSON, {"made_from": _made_from(manifests), "cameras": cameras_of(manifests)})
 
 
 def cameras_of(manifests: Mapping[str, Manifest]) -> dict[str, Any]:

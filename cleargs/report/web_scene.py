@@ -56,8 +56,7 @@ def write_scene(path: Path, name: str, scene: Scene) -> int:
     degree = shown_degree(int(visible.sum()), gaussians.sh_degree)
     shown = gaussians.select(visible)
     shown = Gaussians(**{**shown.tensors(), "sh": shown.sh[:, : (degree + 1) ** 2].contiguous()})
-    packed = gzip.compress(compressed_ply(Scene(shown)), 6, mtime=0)
-    path.write_bytes(_script(name, packed))
+    path.write_bytes(_script(name, gzip.compress(compressed_ply(Scene(shown)), 6, mtime=0)))
     return degree
 
 

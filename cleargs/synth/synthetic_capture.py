@@ -177,7 +177,6 @@ def make_capture(
         _write_transforms(out / "truth" / kind, setup.lens, [f"images/{name}.png" for name in names], exact)
     mean_depth = float(np.mean(depths))
     noise = {"rotation_deg": rules.rotation_noise, "translation": rules.translation_noise * mean_depth}
-    given = noisy_poses(poses, rules, mean_depth, seed)
     summary = {
         "protocol": protocol,
         "seed": seed,
@@ -201,7 +200,7 @@ def make_capture(
     write_json(out / "truth" / "capture.json", summary)
     wrong = 1 + rules.focal_error
     lens = replace(setup.lens, fx=wrong * setup.lens.fx, fy=wrong * setup.lens.fy)
-    _write_transforms(out, lens, images, given)
+    _write_transforms(out, lens, images, noisy_poses(poses, rules, mean_depth, seed))
     return summary
 
 
