@@ -31,11 +31,15 @@ _LENS_GAIN = 0.04
 """`FULL_LENS` is taken where it lowers the mean error of the matches that were kept out by at least this
 share (docs/experiments/poses.md)."""
 
+_LENS_FRAMES = 150
+"""Frames that measure the lens, evenly spread; one bundle adjustment of 600 takes longer than mapping them
+(docs/experiments/poses.md)."""
+
 _CAPPED_PX = 4.0
 """Errors count up to this in means: COLMAP takes a match for right within 4 px of its epipolar line."""
 
+_FARTHEST_PX = 1e4  # stands for an error that is not finite
 _HELD_BY = 15  # fewest points that a frame must see to take part in an adjustment
-_UNPLACED_PX = 1e4  # stands for the error of a match of a frame without a pose
 
 
 class Adjuster:
@@ -55,14 +59,17 @@ class Adjuster:
         self._triangulate = triangulate
 
     def errors(self, model: pycolmap.Reconstruction) -> NDArray[np.float64]:
-        """Return how far the matches that are kept out are from their epipolar lines, px of the images."""
-        images = [image for image in model.images.values() if image.has_pose]
+        """Return how far the matches that are kept out are from their epipolar lines, px of the images.
+
+        Those of frames without a pose do not count.
+        """
+        placed = {key: image for key, image in model.images.items() if image.has_pose}
         found = epipolar_errors(
-            self._kept_out,
-            {image.image_id: image.cam_from_world().matrix() for image in images},
-            {image.image_id: model.cameras[image.camera_id] for image in images},
+            {pair: pixels for pair, pixels in self._kept_out.items() if placed.keys() >= set(pair)},
+            {key: image.cam_from_world().matrix() for key, image in placed.items()},
+            {key: model.cameras[image.camera_id] for key, image in placed.items()},
         )
-        return np.asarray(np.minimum(found, _UNPLACED_PX))
+        return np.asarray(np.minimum(found, _FARTHEST_PX))
 
     def median_error(self, model: pycolmap.Reconstruction) -> float:
         """Return the median of `errors`; 0 where no match was kept out."""
@@ -92,15 +99,23 @@ class Adjuster:
     def adjust(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
         """Return a model that all matches made, adjusted without those that are kept out."""
         adjusted = self._adjusted(self._triangulate(copy.deepcopy(model), self._cut), cameras=cameras)
-        return _anchored(adjusted, model, _held(adjusted) or list(adjusted.images.values()))
+        placed = [image for image in adjusted.images.values() if image.has_pose]
+        return _anchored(adjusted, model, _held(adjusted) or placed)
 
     def with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """Return ``model``, with `FULL_LENS` where it explains the matches that are kept out better."""
         if lens_of(model) != FIRST_LENS:
             return model
-        start = self.adjust(model, cameras=True)
+        start = self.adjust(_thinned(model), cameras=True)
         best = self._with_measured_lens(start)
-        return model if best is start else _anchored(best, model, _held(best))
+        if best is start:
+            return model
+        if best.num_reg_frames() < model.num_reg_frames():
+            whole = copy.deepcopy(model)
+            for key, camera in whole.cameras.items():
+                camera.model, camera.params = best.cameras[key].model, best.cameras[key].params
+            best = self._adjusted(self._triangulate(whole, self._cut), cameras=True)
+        return _anchored(best, model, _held(best))
 
     def _with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         full = copy.deepcopy(model)
@@ -135,6 +150,15 @@ def set_lens(model: pycolmap.Reconstruction, lens: str) -> None:
         camera.model = getattr(pycolmap.CameraModelId, lens)
         more = [radial] if lens == FIRST_LENS else [radial, 0.0, 0.0, 0.0]
         camera.params = [*([focal] if lens == FIRST_LENS else [focal, focal]), *centre, *more]
+
+
+def _thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return ``model`` with the poses of at most `_LENS_FRAMES` frames."""
+    frames = sorted(model.reg_frame_ids())
+    thin = copy.deepcopy(model)
+    for frame in set(frames) - set(frames[:: max(1, -(-len(frames) // _LENS_FRAMES))]):
+        thin.deregister_frame(frame)
+    return thin
 
 
 def median_residual(model: pycolmap.Reconstruction) -> float:
