@@ -32,7 +32,7 @@ _LENS_GAIN = 0.04
 share (docs/experiments/poses.md)."""
 
 _LENS_FRAMES = 150
-"""Frames that measure the lens, evenly spread; one bundle adjustment of 600 takes longer than mapping them
+"""Most frames that measure the lens, evenly spread. The time of an adjustment grows faster than their number
 (docs/experiments/poses.md)."""
 
 _CAPPED_PX = 4.0
@@ -114,7 +114,7 @@ class Adjuster:
             whole = copy.deepcopy(model)
             for key, camera in whole.cameras.items():
                 camera.model, camera.params = best.cameras[key].model, best.cameras[key].params
-            best = self._adjusted(self._triangulate(whole, self._cut), cameras=True)
+            return self.adjust(whole, cameras=True)
         return _anchored(best, model, _held(best))
 
     def _with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
