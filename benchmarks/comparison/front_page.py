@@ -80,7 +80,7 @@ def fault_table(found: Sequence[SavedSection]) -> str:
     if not rows:
         return ""
     head = ["synthetic rooms, by fault", "all frames alike", "ClearGS", "gain"]
-    texts = [[row.fault, _pair(row.before), _pair(row.after), _gain(row.gain)] for row in rows]
+    texts = [[row.fault, _pair(row.before), _pair(row.after), gain_text(row.gain, 1)] for row in rows]
     saved = [one for one in found if one.section.name in SECTIONS]
     section = saved[0].section
     versions = " and ".join(dict.fromkeys(without_digest(one.version) for one in saved))
@@ -93,9 +93,9 @@ def fault_table(found: Sequence[SavedSection]) -> str:
     return f"{Table(head, texts).markdown()}\n\n{line}"
 
 
-def without_digest(version: str) -> str:
-    """Return a version without the digest of the source, for readers."""
-    return version.partition(", source ")[0]
+def without_digest(text: str) -> str:
+    """Return a text with versions without the digests of their sources, for readers."""
+    return re.sub(r", source \w+", "", text)
 
 
 def _has(cells: Cells, protocol: str) -> bool:
@@ -115,10 +115,11 @@ def _pair(means: tuple[float, float | None]) -> str:
     return f"{psnr:.1f} / {'-' if lpips is None else f'{lpips:.3f}'}"
 
 
-def _gain(gain: Spread) -> str:
-    text = f"{gain.mean:+.1f}"
+def gain_text(gain: Spread, digits: int) -> str:
+    """Return a gain with half its 95 % interval, in bold if the interval excludes 0."""
+    text = f"{gain.mean:+.{digits}f}"
     if gain.half_width is not None:
-        text += f" ± {gain.half_width:.1f}"
+        text += f" ± {gain.half_width:.{digits}f}"
     return f"**{text}**" if gain.excludes_zero else text
 
 

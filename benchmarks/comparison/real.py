@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from pydantic import Field, ValidationError
 
 from benchmarks.comparison.cells import Cell, Cells, Spread
 from benchmarks.comparison.findings import Comparison, compare_scenes
-from benchmarks.comparison.front_page import has_block, with_block, without_digest
+from benchmarks.comparison.front_page import BASELINE, gain_text, has_block, with_block, without_digest
 from benchmarks.comparison.pictures import find_image
 from benchmarks.comparison.scenes import Sample, SceneRecipe, evaluate_views, make_scenes
 from benchmarks.comparison.tables import Table
-from benchmarks.comparison.variants import VARIANTS, find_variants
+from benchmarks.comparison.variants import VARIANTS, WHOLE, find_variants
 from benchmarks.images import read_rgb_float
 from cleargs.base_model import FrozenModel
 from cleargs.capture.tables import load_frames
@@ -38,7 +38,10 @@ REFINED = {"psnr": "psnr_refined", "lpips_alex": "lpips_alex_refined"}
 
 SHORT, FULL = "real", "real-full"
 """Names of the places for the two tables in a page."""
-_LABELS = {variant.name: variant.label for variant in VARIANTS} | {"all-view": "all frames alike"}
+_LABELS = {variant.name: variant.label for variant in VARIANTS} | {BASELINE: "all frames alike"}
+"""Variant -> label, in the order of the rows."""
+_COMPARED = (BASELINE, WHOLE)
+"""Variants of the short table."""
 
 
 class RealScene(FrozenModel):
@@ -150,36 +153,39 @@ def run_scenes(
     return found
 
 
-class StoredScene(Figures):
-    """Results of one scene."""
+class Trainings(Figures):
+    """Results of one variant on one scene, a cell per seed."""
 
     version: str
     """Version of the source that made them."""
-    seeds: int
-    cells: tuple[Cell, ...]
+    cells: tuple[Cell, ...] = Field(min_length=1)
 
 
 class RealResults(Figures):
-    """``OUT/real.json``: results of all scenes, which may be of several calls."""
+    """``OUT/real.json``: results of all scenes and variants, which may be of several calls."""
 
-    scenes: dict[str, StoredScene] = Field(default_factory=dict)
+    scenes: dict[str, dict[str, Trainings]] = Field(default_factory=dict)
+    """Scene -> variant -> results."""
     failures: tuple[str, ...] = ()
     """Reasons for what the last call could not make."""
 
-    def with_scenes(self, found: Comparison, version: str, seeds: int) -> RealResults:
-        """Return the results of ``found``, and those of other scenes that an earlier call has stored."""
-        columns = dict.fromkeys(cell.column for cell in found.cells)
-        made = {
-            name: StoredScene(
-                version=version, seeds=seeds, cells=tuple(cell for cell in found.cells if cell.column == name)
-            )
-            for name in columns
-        }
-        return RealResults(scenes=self.scenes | made, failures=tuple(found.failures))
+    def with_results(self, found: Comparison, version: str) -> RealResults:
+        """Return the results of ``found``, and all others that an earlier call has stored."""
+        grouped: dict[str, dict[str, list[Cell]]] = {}
+        for cell in found.cells:
+            grouped.setdefault(cell.column, {}).setdefault(cell.variant, []).append(cell)
+        scenes = dict(self.scenes)
+        for name, variants in grouped.items():
+            made = {
+                variant: Trainings(version=version, cells=tuple(cells)) for variant, cells in variants.items()
+            }
+            both = scenes.get(name, {}) | made
+            scenes[name] = {variant: both[variant] for variant in _LABELS if variant in both}
+        return RealResults(scenes=scenes, failures=tuple(found.failures))
 
     @property
     def cells(self) -> Cells:
-        return Cells(cell for scene in self.scenes.values() for cell in scene.cells)
+        return Cells(cell for scene in self.scenes.values() for made in scene.values() for cell in made.cells)
 
 
 def read_results(path: Path) -> RealResults:
@@ -200,12 +206,11 @@ def real_table(listed: RealList, found: RealResults) -> str:
         stored = found.scenes.get(scene.name)
         if stored is None:
             continue
-        for variant in dict.fromkeys(cell.variant for cell in stored.cells):
-            rows.append([scene.name, _LABELS[variant], *_figures(cells, scene.name, variant)])
-        first = stored.cells[0]
+        rows += [[scene.name, _LABELS[variant], *_figures(cells, scene.name, variant)] for variant in stored]
+        first = next(iter(stored.values())).cells[0]
         notes.append(
             f"* {scene.name}: {scene.protocol}; {first.images} views, {first.steps:,} steps; "
-            f"{_trainings(stored)}; version {stored.version}."
+            f"{_origins(stored)}."
         )
         rows += [_published(one) for one in listed.published if one.scene == scene.name]
     names = {scene.name for scene in listed.scenes}
@@ -215,40 +220,44 @@ def real_table(listed: RealList, found: RealResults) -> str:
         for one in listed.published
         if one.scene not in names or one.scene in found.scenes
     ]
-    line = "Published results are in italics; those marked * were read at second hand."
+    line = (
+        "± is the standard deviation over the trainings. Published results are in italics; those marked * "
+        "were read at second hand."
+    )
     missing = [f"* Not made: {failure}." for failure in found.failures]
     return "\n\n".join([Table(head, rows).markdown(), line, "\n".join([*notes, *missing]), _COMMAND])
 
 
 def summary_table(listed: RealList, found: RealResults) -> str:
     """Return one row per scene, with the published figures of these scenes, as Markdown."""
-    head = ["real capture", "all frames alike", "ClearGS", "processor minutes"]
+    head = ["real capture", "all frames alike", "ClearGS", "gain, dB", "processor minutes"]
     rows, absent = [], []
-    versions: dict[str, list[str]] = {}
+    origins: dict[str, list[str]] = {}
     for scene in listed.scenes:
         stored = found.scenes.get(scene.name)
         if stored is None:
             absent.append(scene.name)
             continue
-        before, after = (found.cells.of("held-out", scene.name, name) for name in ("all-view", "full"))
+        before, after = (found.cells.of("held-out", scene.name, name) for name in _COMPARED)
+        gain = found.cells.difference("held-out", scene.name, WHOLE, BASELINE, "psnr")
         rows.append(
             [
                 f"{scene.name}: {scene.shows}",
-                _short(found.cells, scene.name, "all-view"),
-                _short(found.cells, scene.name, "full"),
+                *(_short(found.cells, scene.name, name) for name in _COMPARED),
+                "-" if gain is None else gain_text(gain, 2),
                 f"{_minutes(before)} and {_minutes(after)}",
             ]
         )
         for one in listed.published:
             if one.scene == scene.name:
                 lpips = "-" if one.lpips is None else f"{one.lpips:.3f}"
-                rows.append([f"*{one.method}, on {one.scene}*", "", f"*{one.psnr:.2f} / {lpips}*", ""])
-        version = f"{without_digest(stored.version)} ({_trainings(stored)})"
-        versions.setdefault(version, []).append(scene.name)
-    made = "; ".join(f"{version} for {', '.join(names)}" for version, names in versions.items())
+                rows.append([f"*{one.method}, on {one.scene}*", "", f"*{one.psnr:.2f} / {lpips}*", "", ""])
+        shown = {variant: made for variant, made in stored.items() if variant in _COMPARED}
+        origins.setdefault(without_digest(_origins(shown)), []).append(scene.name)
+    made = ". ".join(f"{', '.join(names)}: {origin}" for origin, names in origins.items())
     line = (
-        "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians; in brackets with "
-        f"refined test poses. Version {made}."
+        "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians. ± is half the 95 % "
+        f"interval of the gain over the trainings; bold excludes zero. {made}."
     )
     if absent:
         line += f" Still to be measured: {', '.join(absent)}."
@@ -271,21 +280,23 @@ def with_tables(page: str, listed: RealList, found: RealResults) -> str:
 _COMMAND = "Command: `python -m benchmarks real -o OUT --captures DIR`."
 
 
-def _trainings(stored: StoredScene) -> str:
-    return f"mean of {stored.seeds} trainings" if stored.seeds > 1 else "one training"
+def _origins(stored: Mapping[str, Trainings]) -> str:
+    """Return number of trainings and version, with the labels of the variants if these differ."""
+    origins: dict[str, list[str]] = {}
+    for variant, made in stored.items():
+        count = len(made.cells)
+        trainings = f"mean of {count} trainings" if count > 1 else "one training"
+        origins.setdefault(f"{trainings}, version {made.version}", []).append(_LABELS[variant])
+    if len(origins) == 1:
+        return next(iter(origins))
+    return "; ".join(f"{', '.join(labels)}: {origin}" for origin, labels in origins.items())
 
 
 def _short(cells: Cells, column: str, variant: str) -> str:
-    def both(names: Sequence[str]) -> str | None:
-        psnr, lpips = (cells.spread("held-out", column, variant, name) for name in names)
-        if psnr is None:
-            return None
-        return f"{psnr.mean:.2f}" if lpips is None else f"{psnr.mean:.2f} / {lpips.mean:.3f}"
-
-    text, refined = both(list(REFINED)), both(list(REFINED.values()))
-    if text is None:
+    psnr, lpips = (cells.spread("held-out", column, variant, name) for name in REFINED)
+    if psnr is None:
         return "-"
-    return f"{text} ({refined})" if refined else text
+    return f"{psnr.mean:.2f}" if lpips is None else f"{psnr.mean:.2f} / {lpips.mean:.3f}"
 
 
 def _figures(cells: Cells, column: str, variant: str) -> list[str]:

@@ -83,8 +83,8 @@ def real(
     """Train on real captures and compare with published figures.
 
     Writes OUT/real.md (the table), OUT/real.json (all figures) and a picture of blurball (a photograph, all
-    frames alike, ClearGS, the reference). Repeat the command to resume it. Scenes that an earlier call has
-    measured stay in the tables, with their version. Missing captures are named.
+    frames alike, ClearGS, the reference). Repeat the command to resume it. Scenes and variants that
+    an earlier call has measured stay in the tables, with their version. Missing captures are named.
     """
     from benchmarks.comparison.origin import version_of_source
     from benchmarks.comparison.real import (
@@ -117,7 +117,7 @@ def real(
         )
         with opened_store(out / STORE_FOLDER) as store:
             found = run_scenes(out, captures, chosen, wanted, seeds, recipe, store, reporter)
-        results = results.with_scenes(found, version_of_source(), seeds)
+        results = results.with_results(found, version_of_source())
         write_bytes(out / "real.json", results.model_dump_json(indent=1).encode())
         picture = picture or out / "blurball.jpg"
         pictured = f", {picture}" if showcase(picture, out, found) else ""

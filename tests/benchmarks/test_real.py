@@ -86,8 +86,8 @@ def results() -> RealResults:
         for name in ("all-view", "full")
         for seed in (0, 1)
     ]
-    return RealResults().with_scenes(
-        Comparison(cells=cells, failures=["fox: it is missing"]), "0.2.0, abc, source 0123", 2
+    return RealResults().with_results(
+        Comparison(cells=cells, failures=["fox: it is missing"]), "0.2.0, abc, source 0123"
     )
 
 
@@ -104,15 +104,15 @@ def test_the_table_has_means_over_seeds_and_published_figures() -> None:
 def test_the_short_table_has_a_row_per_scene() -> None:
     table = summary_table(read_real_list(), results())
     (row,) = [line for line in table.splitlines() if line.startswith("| blurball")]
-    assert row.endswith("| 29.00 / 0.200 (29.50 / 0.100) | 30.00 / 0.200 (30.50 / 0.100) | 2.0 and 2.0 |")
-    assert "| *Deblur-NeRF, 200,000 iterations, on blurball* |  | *27.33 / 0.223* |  |" in table
-    assert "Version 0.2.0, abc (mean of 2 trainings) for blurball." in table and "CoMoGaussian" not in table
+    assert row.endswith("| 29.00 / 0.200 | 30.00 / 0.200 | **+1.00 ± 0.00** | 2.0 and 2.0 |")
+    assert "| *Deblur-NeRF, 200,000 iterations, on blurball* |  | *27.33 / 0.223* |  |  |" in table
+    assert "blurball: mean of 2 trainings, version 0.2.0, abc." in table and "CoMoGaussian" not in table
     assert "Still to be measured: kitchen, office, fox, terrace, bonsai." in table
 
 
 def test_scenes_of_an_earlier_call_stay_with_their_version(tmp_path: Path) -> None:
     fox = cell("full", 0, 25.0).model_copy(update={"column": "fox"})
-    both = results().with_scenes(Comparison(cells=[fox]), "0.3.0, def", 1)
+    both = results().with_results(Comparison(cells=[fox]), "0.3.0, def")
     assert both.scenes.keys() == {"blurball", "fox"} and both.failures == ()
     (tmp_path / "real.json").write_text(both.model_dump_json())
     assert read_results(tmp_path / "real.json") == both
@@ -124,10 +124,25 @@ def test_scenes_of_an_earlier_call_stay_with_their_version(tmp_path: Path) -> No
     assert read_results(tmp_path / "absent.json") == RealResults()
 
 
+def test_variants_of_an_earlier_call_stay_with_their_version() -> None:
+    listed = read_real_list()
+    added = results().with_results(Comparison(cells=[cell("paper-open", 0, 24.0)]), "0.3.0, def, source 4567")
+    table = real_table(listed, added)
+    labels = [line.split(" | ")[1] for line in table.splitlines() if line.startswith("| blurball")]
+    assert labels[:3] == ["all frames alike", "ClearGS", "paper's method, open models"]
+    assert "all frames alike, ClearGS: mean of 2 trainings, version 0.2.0, abc, source 0123; " in table
+    assert "paper's method, open models: one training, version 0.3.0, def, source 4567." in table
+    assert "blurball: mean of 2 trainings, version 0.2.0, abc." in summary_table(listed, added)
+    again = added.with_results(Comparison(cells=[cell("full", 0, 31.0)]), "0.3.0, def")
+    assert list(again.scenes["blurball"]) == ["all-view", "full", "paper-open"]
+    assert [one.means["psnr"] for one in again.scenes["blurball"]["full"].cells] == [31.0]
+    assert "| +3.00 | 2.0 and 2.0 |" in summary_table(listed, again), "pairs of the same seed"
+
+
 def test_a_page_gets_the_tables_that_it_has_places_for() -> None:
     listed, found = read_real_list(), results()
-    short, full = "<!-- real -->\nold\n<!-- /real -->\n", "<!-- real-full -->\n<!-- /real-full -->\n"
-    assert summary_table(listed, found) in (page := with_tables(short, listed, found)) and "old" not in page
+    short, full = "<!-- real -->\nstale\n<!-- /real -->\n", "<!-- real-full -->\n<!-- /real-full -->\n"
+    assert summary_table(listed, found) in (page := with_tables(short, listed, found)) and "stale" not in page
     both = with_tables(short + full, listed, found)
     assert summary_table(listed, found) in both and real_table(listed, found) in both
     assert real_table(listed, found) in with_tables(full, listed, found)
