@@ -19,13 +19,13 @@ from benchmarks.comparison.variants import VARIANTS, WHOLE, find_variants
 from benchmarks.images import read_rgb_float
 from cleargs.base_model import FrozenModel
 from cleargs.capture.tables import load_frames
-from cleargs.errors import CleargsError, ConfigError, InputError
+from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.eval_report import Figures
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
-from cleargs.safe_io import FAULTS, cause, read_bytes, read_text
+from cleargs.safe_io import read_bytes, read_text
 
 SHOWCASE = "blurball"
 """Scene of the picture: its licence (CC BY 4.0) allows to show it."""
@@ -78,18 +78,9 @@ class RealList(FrozenModel):
     published: tuple[Published, ...]
 
 
-def read_real_list(path: Path | None = None) -> RealList:
-    """Read a list of real captures, by default ``real.toml``; raise ConfigError if it is invalid."""
-    hint = "compare it with benchmarks/comparison/real.toml"
-    try:
-        text = read_text(path or Path(__file__).with_name("real.toml"))
-        return RealList.model_validate(tomllib.loads(text))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ConfigError(f"list of real captures, {place}: {first['msg']}", hint=hint) from error
-    except FAULTS as error:
-        raise ConfigError(f"cannot read the list of real captures: {cause(error)}", hint=hint) from error
+def read_real_list() -> RealList:
+    """Read ``real.toml``."""
+    return RealList.model_validate(tomllib.loads(read_text(Path(__file__).with_name("real.toml"))))
 
 
 def find_scenes(listed: RealList, names: Sequence[str]) -> tuple[RealScene, ...]:
