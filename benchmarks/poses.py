@@ -1,7 +1,7 @@
-"""Poses and cameras with known errors: what an adjustment and SfM make of them.
+"""Measure how well an adjustment and SfM correct poses and cameras with known errors.
 
-``python -m benchmarks poses -o OUT`` prints the ratios by which ingest decides which poses it takes
-(docs/experiments/poses.md), next to the distances of the cameras from the true ones.
+``python -m benchmarks poses -o OUT`` prints the errors by which ingest decides which poses it takes
+(docs/experiments/poses.md), and the distances of the cameras from the true ones.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ GIVEN = {
     "rough": (2.0, 0.06, 0.13),
     "wrong": (5.0, 0.15, 0.2),
 }
-"""Errors of the given cameras: standard deviations of rotation (degrees per axis) and centre (per axis, share
-of the farthest camera's distance), and the share by which the focal length is wrong."""
+"""Errors of the given cameras: standard deviation of the rotation (degrees per axis), that of the centre (per
+axis, as a share of the farthest camera's distance), and relative error of the focal length."""
 
 LENSES = {
     "pinhole": (0.0, 0.0, 0.0, 0.0),
@@ -56,12 +56,12 @@ FIGURES = (
     *("mean_adjusted", "mean_sfm"),
     *("off_before", "off_adjusted", "off_sfm", "lens_gain"),
 )
-"""Residual at the given poses, errors of the kept-out matches (px; medians, then means up to 4), distances of
-the cameras from the true ones (medians, in the farthest camera's distance), and gain by the richer lens."""
+"""Residual at the given poses, px; errors of matches that the fit did not use, px (medians, then means of
+errors up to 4); median distances from the true cameras (shares as in `GIVEN`); gain by `FULL_LENS`."""
 
 
 def rooms(folder: Path, seed: int, size: int) -> list[Path]:
-    """Make rooms seen through four lenses, and with faults that no poses explain."""
+    """Make a capture of a room for each of `LENSES`, and for each of `FAULTS`, which no poses explain."""
     clean = replace(PROTOCOLS["camera"], rotation_noise=0.0, translation_noise=0.0, focal_error=0.0)
     variants = {name: replace(clean, distortion=terms) for name, terms in LENSES.items()}
     found = []
@@ -82,7 +82,7 @@ def rooms(folder: Path, seed: int, size: int) -> list[Path]:
 
 
 def measure(capture: Path, work: Path, size: int) -> list[dict[str, str | float]]:
-    """Return a row for each of `GIVEN`."""
+    """Return a row of `FIGURES` for each of `GIVEN`."""
     config = SfmConfig(max_features=700)
     frames = prepare(open_capture(capture, CaptureConfig()), work, size, SilentReporter())
     given = [frame.source.pose for frame in frames if frame.source.pose is not None]
@@ -137,7 +137,7 @@ def _reconstructed(
 def _worker(
     frames: Sequence[WorkFrame], poses: Sequence[Pose] | None, work: Path, config: SfmConfig
 ) -> sfm_worker._Sfm:
-    """Return COLMAP's work on ``frames`` after their features were matched."""
+    """Return COLMAP's worker for ``frames``, with their features extracted and matched."""
     job = job_of(frames, None if poses is None else {OWN: poses}, work, config, 0, 1)
     sfm = sfm_worker._Sfm(job, lambda **_: None)
     pycolmap.set_random_seed(0)
@@ -154,7 +154,7 @@ def _moved(pose: Pose, turn: NDArray[np.float64], shift: NDArray[np.float64]) ->
 
 
 def _off(model: pycolmap.Reconstruction, true: Sequence[Pose]) -> float:
-    """Return the median distance of the centres from the true ones, in the farthest camera's distance."""
+    """Return the median distance of the centres from the true ones, after an alignment; units of ``true``."""
     laid, known = copy.deepcopy(model), copy.deepcopy(model)
     for image in known.images.values():
         pose = true[image.image_id - 1]
@@ -166,7 +166,7 @@ def _off(model: pycolmap.Reconstruction, true: Sequence[Pose]) -> float:
 
 
 def _gain(adjuster: Adjuster, model: pycolmap.Reconstruction) -> float:
-    """Return the share by which the richer lens lowers the mean error of the matches that were kept out."""
+    """Return the share by which `FULL_LENS` lowers the mean error of the matches that the fit did not use."""
     simple = copy.deepcopy(model)
     set_lens(simple, "SIMPLE_RADIAL")
     simple = adjuster.adjust(simple, cameras=True)

@@ -18,11 +18,11 @@ import click
 )
 @click.option("--size", default=320, show_default=True, help="Long side of the images, px.")
 def poses(captures: Sequence[Path], output: Path, seed: int, size: int) -> None:
-    """Print how wrong poses of CAPTURES, or of synthetic rooms, are adjusted and found again.
+    """Add errors to the poses of CAPTURES, or of synthetic rooms, and print how well they are corrected.
 
-    A capture without poses is reconstructed first, and counts as true.
+    A capture without poses is reconstructed first. The result counts as true.
     """
-    from benchmarks.poses import FIGURES, measure, rooms  # they need pycolmap: a rented GPU has none
+    from benchmarks.poses import FIGURES, measure, rooms  # they need pycolmap, which rented GPUs lack
 
     found = list(captures) or rooms(output, seed, size)
     click.echo(",".join(("capture", "given", *FIGURES)))

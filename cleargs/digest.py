@@ -62,8 +62,8 @@ class DigestMemo:
     """A cache of digests by path, size, inode, mtime and ctime, stored in an SQLite file.
 
     Any program can set mtime. Only the kernel sets ctime: at every write, and also when mtime is set back. If
-    the file is damaged, locked or not writable, digests are computed again, and no error is raised. It is
-    read at the start and written at the end, if its folder exists by then.
+    the SQLite file is damaged, locked or not writable, digests are computed again, and no error is raised.
+    The file is read at the start and written at the end, if its folder exists by then.
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,7 +111,7 @@ class DigestMemo:
         self._learnt[str(path.absolute())] = NOTHING
 
     def digests_of(self, external: External, *, rehash: bool = False) -> dict[str, str]:
-        """Return the digests of files outside the store, read even if the memo has them with ``rehash``.
+        """Return the digests of files outside the store. With ``rehash``, read every file again.
 
         They are ``{"": digest}`` for a file, relative path -> digest for a folder, or name -> digest.
         InputError is raised if a file is missing, not regular or not readable, or if its name is not UTF-8.

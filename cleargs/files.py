@@ -26,8 +26,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path that becomes ``path`` when the block ends without an error.
 
     The temporary file has the extension of ``path``, by which image writers choose their format. A writer
-    that dies leaves ``path`` unchanged; of several writers at once, the last one wins. StoreError is raised
-    if the disk is full or not writable.
+    that dies leaves ``path`` unchanged. If several write at once, the last one wins. Raises StoreError if the
+    disk is full or not writable.
     """
     temporary = path.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{path.name}")
     try:

@@ -1,6 +1,6 @@
-"""The NVIDIA GPU of this machine: what keeps it from use, its self-test, and the device that follows.
+"""The NVIDIA GPU of this machine: obstacles to its use, its self-test, and the choice of the device.
 
-Nothing here imports torch, which takes seconds. A kernel may hang or crash: the self-test is a child process.
+Nothing here imports torch, which takes seconds. The self-test is a child process: a kernel may hang or crash.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from cleargs.subprocesses import module_command
 SELF_TEST = "cleargs.splat.kernels.cuda.self_test"
 
 LIMIT_S = 300.0
-"""Triton compiles for one to two minutes, the checks take at most one."""
+"""Time limit of the self-test, s. Triton compiles for one to two minutes; the checks take at most one."""
 
 NO_GPU = "there is no NVIDIA GPU"
 
 
 def cuda_obstacle(root: Path = Path("/")) -> str | None:
-    """Return why work cannot run on an NVIDIA GPU here, or None. ``root`` holds ``dev`` and ``sys``."""
+    """Return the reason why no NVIDIA GPU can be used, or None. ``root`` contains ``dev`` and ``sys``."""
     if os.environ.get("CUDA_VISIBLE_DEVICES", "0") in ("", "-1"):  # hidden on purpose
         return NO_GPU
     if not any((root / node).exists() for node in ("dev/nvidiactl", "dev/dxg")):
@@ -71,10 +71,10 @@ class SelfTest(NamedTuple):
     """The result of a self-test."""
 
     facts: dict[str, str]
-    """The result depends on these: see `current_facts`."""
+    """Facts on which the result depends: see `current_facts`."""
     checks: list[Check]
     gpu_ms: float = 0.0
-    """Duration of a training step on the GPU; 0 where it was not measured."""
+    """Duration of a training step on the GPU, ms; 0 if it was not measured."""
     cpu_ms: float = 0.0
     keep: bool = True
     """False: the GPU's memory was full, or no GPU was visible. The next test may pass."""
@@ -86,12 +86,12 @@ class SelfTest(NamedTuple):
 
     @property
     def device(self) -> Literal["cpu", "cuda"]:
-        """The device that ``--device auto`` takes."""
+        """The device that ``--device auto`` chooses."""
         return "cuda" if self.fault is None and self.gpu_ms < self.cpu_ms else "cpu"
 
     @property
     def reason(self) -> str:
-        """Why ``--device auto`` takes `device`, in one line."""
+        """Reason why ``--device auto`` chooses `device`, in one line."""
         if self.fault is not None:
             return f"the GPU failed its self-test ({self.fault}); cleargs doctor --gpu repeats it"
         return f"{self.facts['gpu']} passed its self-test; {self._pace()}"
@@ -111,9 +111,9 @@ class SelfTest(NamedTuple):
 
 
 def current_facts(root: Path = Path("/")) -> dict[str, str]:
-    """Return what a self-test's result depends on: GPU, driver, versions, digest of the kernel sources.
+    """Return the facts that decide a self-test's result: GPU, driver, versions, digest of kernel sources.
 
-    Linux names GPU and driver in files below ``root``; where it does not (WSL), nvidia-smi does.
+    Linux states GPU and driver in files below ``root``. If these are missing (WSL), nvidia-smi is called.
     """
     folder, text = root / "proc/driver/nvidia", ""
     with suppress(OSError):
@@ -163,10 +163,10 @@ def self_test(
     command: Sequence[str] | None = None,
     limit_s: float = LIMIT_S,
 ) -> SelfTest:
-    """Run the self-test at the `current_facts`, and keep its result in the user's cache folder.
+    """Run the self-test, and store its result under ``facts`` (`current_facts`) in the user's cache folder.
 
-    ``say`` takes a remark before the test starts. ``command`` is the child process, by default the module
-    `SELF_TEST`, which is ended after ``limit_s`` seconds.
+    ``say`` receives a remark before the test starts. ``command`` starts the child process (by default the
+    module `SELF_TEST`), which is ended after ``limit_s`` seconds.
     """
     say("testing the GPU (once per driver and version; it takes up to three minutes)")
     command = command or module_command(SELF_TEST)
@@ -188,7 +188,7 @@ def self_test(
 
 
 def read_result(facts: dict[str, str], output: str) -> SelfTest:
-    """Return the result that the lines of the child process tell."""
+    """Return the result in ``output``, the JSON lines that the child process printed."""
     result, running = SelfTest(facts, []), "start"
     for line in output.splitlines():
         with suppress(*FAULTS):

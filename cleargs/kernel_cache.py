@@ -27,9 +27,9 @@ def cache_folder(name: str) -> Path:
 
 
 def installation() -> str:
-    """Return a digest of the places and times of the kernels' sources.
+    """Return a digest of the paths and modification times of the kernels' sources.
 
-    Numba compiles again where one of them differs, such as in another environment with the same program.
+    Numba compiles again if one of them differs, for example in another environment with the same program.
     """
     sources = sorted(Path(__file__).parent.glob("splat/kernels/cpu/*.py"))
     stamps = repr([(str(source), source.stat().st_mtime_ns) for source in sources])

@@ -79,7 +79,7 @@ class Manifest(FrozenModel):
     """Start time in UTC, ISO 8601."""
     seconds: float
     compile_seconds: float = 0.0
-    """Spent on compiling kernels, which a machine does once; no part of ``seconds``."""
+    """Time spent on compiling kernels, which a machine does once. It is not part of ``seconds``."""
     cpu_seconds: float | None = None
     """CPU time of all threads and child processes; None in manifests of earlier versions."""
     peak_memory_gb: float | None = None
@@ -142,12 +142,12 @@ def linked_manifest(run: Path, stage: str) -> Manifest | None:
 
 
 def hidden_link(run: Path, stage: str) -> Path:
-    """Return the path of the link to the results of ``stage`` before the settings or inputs changed."""
+    """Return the path of the link to the results that ``stage`` had before its settings or inputs changed."""
     return run / f".{stage}.before"
 
 
 def last_shown(run: Path, stage: str) -> Manifest | None:
-    """Return the manifest in ``RUN/<stage>``, or that of before the settings or inputs changed."""
+    """Return the manifest in ``RUN/<stage>``, or the one from before the settings or inputs changed."""
     return linked_manifest(run, stage) or linked_manifest(run, hidden_link(run, stage).name)
 
 

@@ -1,4 +1,4 @@
-"""The words that start this program in the user's shell, for the commands that it prints."""
+"""The command that starts this program in the user's shell, for the messages that it prints."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 from cleargs.subprocesses import module_command
 
 PROGRAM = "CLEARGS_PROGRAM"
-"""Environment variable with these words. A path in it is absolute."""
+"""Environment variable with this command. A path in it is absolute."""
 
 
 def name_program() -> None:
-    """Store in the environment how this program is started, also for the processes that it starts.
+    """Store the command that starts this program in the environment, which child processes inherit.
 
-    It is ``cleargs`` where the shell finds this installation under that name, or else its path.
+    It is ``cleargs`` if the shell finds this installation under that name, or else the path of the program.
     """
     if PROGRAM in os.environ:
         return
@@ -29,7 +29,7 @@ def name_program() -> None:
 
 
 def program(folder: Path) -> str:
-    """Return the words that start this program in a shell whose working directory is ``folder``."""
+    """Return the command that starts this program in a shell whose working directory is ``folder``."""
     name, *others = shlex.split(os.environ.get(PROGRAM, "cleargs"))
     near = Path(name).is_relative_to(folder) and Path(name).parent != folder
     return shlex.join([str(Path(name).relative_to(folder)) if near else name, *others])

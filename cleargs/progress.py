@@ -49,11 +49,11 @@ class Reporter(Protocol):
 
 
 COMPILING = "compiling kernels, once on this machine"
-"""Label of a task that a machine does once. Its seconds do not count as a stage's."""
+"""Label of a task that a machine does once. Its time is not part of the time of a stage."""
 
 
 class Rate:
-    """Steps per second over the last seconds, since steps of a training become slower."""
+    """Steps per second over the last seconds only, because steps of a training become slower."""
 
     SECONDS = 10.0
     """Averaging window: one to two times this many seconds, less at the beginning."""
@@ -136,7 +136,7 @@ class LineReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         last = begin = time.monotonic()
-        if total is None:  # no line may come until the end
+        if total is None:  # there may be no other line until the end
             self._progress(f"{label}: started")
 
         def show(done: int, note: str, left: float | None) -> None:

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Stream(IntEnum):
-    """Purposes of random numbers. The value follows the seed, so a changed value changes results."""
+    """Purposes of random numbers. The value is a part of the seed, so a changed value changes results."""
 
     REAL_VIEWS = 0
     PSEUDO_VIEWS = 1

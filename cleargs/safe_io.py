@@ -110,7 +110,7 @@ def cause(error: Exception) -> str:
 def faults_as(
     kind: type[CleargsError], what: str, *, hint: str, faults: tuple[type[Exception], ...] = FAULTS
 ) -> Iterator[None]:
-    """Turn one of the ``faults`` in the block into an error of the ``kind``: ``what``, then its cause."""
+    """Turn one of the ``faults`` in the block into an error of class ``kind``, worded ``what: cause``."""
     try:
         yield
     except faults as error:

@@ -18,7 +18,7 @@ def pace(say: Callable[[str], None] | None = None) -> float:
 
 
 def gpu_fault(error: BaseException) -> str | None:
-    """Return in one line what failed on the GPU if that is the cause of ``error``, else None."""
+    """Return one line about the GPU failure that caused ``error``; None if the GPU is not the cause."""
     from cleargs.splat.kernels.cuda.support import gpu_fault
 
     return gpu_fault(error)

@@ -13,7 +13,7 @@ from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig, steps_from_frames
 
 G0_END, ROUNDS_END = 16 / 19, 18 / 19
-"""Shares of the schedule of the whole method at which the first scene and RIVR's rounds end."""
+"""Positions, from 0 to 1, in the schedule of all trainings: the ends of G0 and of RIVR's rounds."""
 
 MAX_ROUNDS = 16
 """Maximum number of RIVR's rounds."""

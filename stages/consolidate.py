@@ -1,4 +1,4 @@
-"""Full-Trajectory Repair Consolidation: a last distillation of every frame's latest repair."""
+"""Full-Trajectory Repair Consolidation: a last training on raw frames and every frame's latest repair."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .config import other_libraries as other_libraries
 
 
 class FinalDistilConfig(DistilConfig):
-    """The final distillation."""
+    """Settings of the final distillation (training on raw frames and repairs)."""
 
     begin: float = Field(
         ROUNDS_END, ge=0, lt=1, description="share of the schedule that lies behind when this training begins"
@@ -31,7 +31,7 @@ class ConsolidateConfig(FrozenModel):
     scorer: str = Field(
         "clarity-net",
         description="measures harm, whose limits are in [rivr.harm]: the name of a scorer, or an ONNX file",
-        json_schema_extra={"key": False, "plugin": "scorers"},  # its content is in the key
+        json_schema_extra={"key": False, "plugin": "scorers"},  # the key contains the digest of its file
     )
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
@@ -51,7 +51,7 @@ LIBRARIES = REPAIR_LIBRARIES
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
-    """Return the scorer's model file, whose content enters the key; none for one of another package."""
+    """Return the scorer's model file, whose content enters the key; no file for another package's scorer."""
     from cleargs.models.registry import model_file
 
     path = model_file(config.scorer, "scorer")
@@ -59,7 +59,7 @@ def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: ConsolidateConfig) -> None:
-    """Load the scorer. Raises InputError if it is not installed, damaged or of another form."""
+    """Load the scorer. Raises InputError if it is not installed, is damaged, or cannot be used."""
     from cleargs.models.scorer import load_scorer
 
     load_scorer(config.scorer)
@@ -84,7 +84,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
 
 
 def run(context: StageContext[ConsolidateConfig]) -> StageResult:
-    """Distil the latest accepted repairs from RIVR's scene and check for harm."""
+    """Train RIVR's scene on raw frames and the latest accepted repairs, and check the result for harm."""
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr import tables
@@ -149,7 +149,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
 
 
 def _unchanged(context: StageContext[ConsolidateConfig]) -> StageResult:
-    """Publish G0's scene as it is, which is all that a draft does."""
+    """Publish G0's scene unchanged: a draft makes no repairs."""
     from cleargs.rivr.distillation import TrainedScene, publish
     from cleargs.rivr.tables import write_repairs
 

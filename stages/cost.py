@@ -16,7 +16,7 @@ _SERIAL = 0.1  # share of the work that is not parallel (a guess)
 
 
 def capture_size(context: StageContext[Any]) -> tuple[int, float]:
-    """Return the number of placed training frames, and megapixels per frame. Estimate both before ingest."""
+    """Return the number of placed training frames and megapixels of the largest; estimates before ingest."""
     if (expected := context.expected.get("ingest")) is not None and expected.frames:
         return expected.frames, expected.megapixels
     if "ingest" not in context.inputs:

@@ -42,11 +42,11 @@ class G0Config(TrainConfig):
     )
 
     exposure_threshold: ClassVar[float] = 0.05
-    """Spread of the frames' gains from which ``auto`` is on: with a fixed exposure it stays below."""
+    """``auto`` is on if the `gain_spread` of the frames is above this. With a fixed exposure it is below."""
 
 
 def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
-    """Return the settings with the end of the schedule: in a draft nothing follows."""
+    """Return the settings. In a draft, this training ends the schedule, because no other training follows."""
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
@@ -63,7 +63,7 @@ LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless
 
 
 def other_libraries(device: Device, config: object) -> Mapping[str, str]:
-    """Return further libraries that compute on ``device``."""
+    """Return the versions of further libraries that compute on ``device``."""
     return {"triton": installed_version("triton")} if device == "cuda" else {}
 
 
@@ -77,7 +77,7 @@ def preflight(config: G0Config) -> None:
 
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
-    """Return steps times a cost per pixel and per Gaussian.
+    """Estimate the cost. The time is the number of steps times a cost per pixel and per Gaussian.
 
     The memory is that of the images, the Gaussians and the buffers of the kernels.
     """
@@ -96,7 +96,7 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
 
 
 def run(context: StageContext[G0Config]) -> StageResult:
-    """Make Gaussians of the sparse points and train them on the active frames with their RVA weights."""
+    """Make Gaussians from the sparse points and train them on the active frames with their RVA weights."""
     from cleargs.capture.folders import spread
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.formation.capture import CaptureFormation
@@ -189,7 +189,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
 
 
 def movement_expected(config: G0Config, allocation: Sequence[Mapping[str, Any]]) -> bool:
-    """Return True if movement is to be looked for, by the rows of ``rva/frames.parquet``."""
+    """Return True if the training must look for movement; ``allocation`` are RVA's rows of the frames."""
     from cleargs.formation.movement import HIDING
 
     asked = config.formation.movement

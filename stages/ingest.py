@@ -43,7 +43,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
     @field_validator("holdout")
     @classmethod
     def _known_holdout(cls, value: str) -> str:
-        # Letters before a colon are meant for a rule; a frame may be named by a time of day.
+        # Letters before a colon name a rule. Digits do not: a frame may be named by a time of day.
         unknown = re.match(r"[A-Za-z]+:", value) and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value)
         if value in ("every:1", "sharpest:1"):
             raise ValueError(f"{value} would hold out every frame")
@@ -56,11 +56,11 @@ FEW_FRAMES = 20
 """Number of frames below which a warning is given."""
 
 DRAFT_FRAMES, DRAFT_SIZE = 60, 640
-"""Most frames of a draft, and their longest side, px."""
+"""Maximum number of frames in a draft, and maximum long side of its images, px."""
 
 
 def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig:
-    """Return the settings within the limits of a draft, where the run is one."""
+    """Return the settings, limited to `DRAFT_FRAMES` and `DRAFT_SIZE` if the run is a draft."""
     if getattr(sections.get("g0"), "quality", None) != "draft":
         return config
     frames, size = min(config.max_frames, DRAFT_FRAMES), min(config.max_size, DRAFT_SIZE)
@@ -75,13 +75,13 @@ OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images",
 LEFTOVERS = ("images/*.png",)
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "pillow", "numpy", "scipy")
 
-# Wall seconds on two cores: features per frame, fixed and per megapixel; matches per pair, fixed and per
-# square megapixel, because each feature is compared with each other; most features per megapixel.
+# Wall seconds on two cores: features per frame and per megapixel; matches per pair and per squared megapixel,
+# because all features of two frames are compared. Then the maximum number of features per megapixel.
 _FEATURES_S, _FEATURES_S_PER_MEGAPIXEL = 0.015, 0.7
 _PAIR_S, _PAIR_S_PER_SQUARE_MEGAPIXEL = 0.0025, 0.15
 _FEATURES_PER_MEGAPIXEL = 7000
-# Seconds of one core: start of COLMAP's process; per megapixel of a frame, to read and undistort it, and to
-# map it without and with a pose.
+# Seconds on one core: to start COLMAP's process; per megapixel of a frame, to read and undistort it, to find
+# its pose (mapping), and to triangulate points at its given pose.
 _START_S = 1.0
 _FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 1.3, 0.2
 
@@ -133,7 +133,7 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
 
 
 def run(context: StageContext[IngestConfig]) -> StageResult:
-    """Choose frames, make them upright and small, find or take their poses, undistort, publish."""
+    """Choose frames, rotate and reduce them, find poses or use the given ones, undistort and publish."""
     from cleargs.capture.choice import held_out, holdout_hash, select_sharp_frames
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish

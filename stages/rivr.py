@@ -51,7 +51,7 @@ class RivrConfig(FrozenModel):
         "embedded",
         description="restoration expert: embedded, a name of `cleargs models list`, an ONNX file, or one "
         "of another package",
-        json_schema_extra={"key": False, "plugin": "experts"},  # its content is in the key
+        json_schema_extra={"key": False, "plugin": "experts"},  # the key contains the digest of its file
     )
     primary_scorer: str = Field(
         "clarity-net",
@@ -103,8 +103,8 @@ class RivrConfig(FrozenModel):
     def distillation(self, g0: TrainConfig, round: int, done: int, steps: int, frames: int) -> TrainConfig:
         """Return the settings of a training of ``steps`` steps with its part of the schedule.
 
-        ``round`` counts from 1, and ``done`` steps of it are before this training. The steps of a round
-        follow from the number of active ``frames`` where they are unset.
+        ``round`` counts from 1. ``done`` steps of the round precede this training. If the steps of a round
+        are unset, they follow from the number of active ``frames``.
         """
         whole = self.distil.applied_to(g0, frames)
         step = (whole.end - whole.begin) / (self.rounds * whole.length)
@@ -129,7 +129,7 @@ LIBRARIES = REPAIR_LIBRARIES
 
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
-    """Return the model files, whose content enters the key; of other packages the version does."""
+    """Return the model files. Their content enters the key; for models of other packages, a version does."""
     from cleargs.models.registry import model_file
 
     files = {
@@ -141,7 +141,7 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: RivrConfig) -> None:
-    """Load expert and scorers. Raises InputError if one is not installed, damaged or of another form."""
+    """Load expert and scorers. Raises InputError if one is not installed, is damaged, or cannot be used."""
     from cleargs.models.expert import load_expert
     from cleargs.models.scorer import load_scorer
 
@@ -153,8 +153,8 @@ def preflight(config: RivrConfig) -> None:
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Return the cost of the candidates and of the distillations.
 
-    On two cores undoing motion takes about 3 s per megapixel, restoring 1 s (40 s with another expert than
-    the embedded one), making and scoring candidates 2 s. Every group leaves a scene until the end.
+    On two cores, per megapixel, undoing motion takes about 3 s, restoring 1 s (40 s with an expert other than
+    the embedded one), and making and scoring candidates 2 s. The scene of every group is kept until the end.
     """
     from cleargs.splat.budget import training_cost
 
@@ -257,9 +257,9 @@ def _repair_and_distil(
 ) -> tuple[list[Selection], list[Path], TrainedScene]:
     """Run every round along the trajectory, group by group.
 
-    A round in which no candidate is taken is the last one. Its training also takes the steps of the rounds
-    that are left. Returns the rows of all frames (``others``, those of the frames that no round repairs,
-    first), the folders of the trainings, and the last scene.
+    A round that accepts no candidate is the last one. Its training also gets the steps of the remaining
+    rounds. Returns the rows of all frames (first ``others``, the rows of frames that no round repairs), the
+    folders of the trainings, and the last scene.
     """
     from cleargs.rivr.distillation import drop_state
     from cleargs.rivr.rounds import pseudo_view, run_round
@@ -296,7 +296,7 @@ def _repair_and_distil(
                 reporter.info(
                     f"{label}: no candidate is taken; the {steps} steps left train without new ones"
                 )
-            # Without either the scene stays as it is, and the next group gets the steps.
+            # Nothing is trained without repairs and kept frames: the next group gets the steps.
             if not (repairs or kept) or not steps:
                 continue
             current = current.trained(
@@ -321,7 +321,7 @@ def _repair_and_distil(
 
 
 def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: TrainedScene) -> StageResult:
-    """Publish G0's scene as it is, which is all that a draft does."""
+    """Publish G0's scene unchanged: a draft makes no repairs."""
     from cleargs.rivr.distillation import publish
     from cleargs.rivr.tables import Selection, write_selection
 

@@ -52,7 +52,7 @@ def estimate(context: StageContext[RvaConfig]) -> Estimate:
 
 
 def run(context: StageContext[RvaConfig]) -> StageResult:
-    """Compute cues, then R and B, geometric utility, roles, coverage and weights, and write both tables.
+    """Compute cues, R (reliability), B (degradation risk), geometry, roles and weights; write both tables.
 
     A frame that the evaluator could not score is treated like a frame without a pose: it is in no set
     and has weight 0. The result of the stage is then partial.

@@ -86,7 +86,7 @@ def student_t(freedom: int) -> float:
 
 
 def spread(values: Sequence[float]) -> Spread:
-    """Return the spread of at least one value; it is infinite if a value is (PSNR of equal images)."""
+    """Return the spread of at least one value. The mean is infinite if a value is (PSNR of equal images)."""
     mean = math.fsum(values) / len(values)
     if len(values) < 2:
         return Spread(mean, None, len(values))

@@ -21,7 +21,7 @@ from cleargs.types import ImageF32
 Distance = Callable[[ImageF32, ImageF32], float]
 
 RAW = "observed"
-"""Layer of the raw frame. RIVR may choose it too, which keeps the frame unrepaired."""
+"""Layer of the raw frame. If RIVR chooses it, the frame is not repaired."""
 
 _MIN_ERROR = 1e-10
 """Minimum mean squared error: it limits the PSNR of equal images to 100 dB."""
@@ -82,7 +82,7 @@ class ChoiceAgreement(FrozenModel):
 
 
 def agreement(rows: Sequence[ChoiceRow]) -> ChoiceAgreement:
-    """Summarise the choices of ``rows``."""
+    """Return how often the choices of ``rows`` are the best ones."""
     repaired = [row for row in rows if row.chosen != RAW]
 
     def mean(values: Iterable[float]) -> float | None:

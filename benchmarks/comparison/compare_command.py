@@ -228,7 +228,7 @@ def _given(options: Mapping[str, str]) -> list[str]:
 
 
 def _check_names(names: Sequence[str], what: str) -> None:
-    """Raise InputError for equal names: such captures would share a run folder, such runs a table row."""
+    """Raise InputError for equal names: captures would share a run folder, and runs a row of the tables."""
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(

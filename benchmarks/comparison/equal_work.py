@@ -20,11 +20,11 @@ from cleargs.pipeline.dag import Dag
 
 @dataclass(frozen=True)
 class EqualWork:
-    """Work that each variant of a sample gets."""
+    """Training work of each variant of a sample (a capture and a seed)."""
 
     steps: int
     frames: int
-    """Number of frames from which steps are derived that the settings leave open."""
+    """Number of frames. It determines the steps if the settings do not."""
     budget: int
     """Maximum number of Gaussians."""
     sh_degree: int
@@ -63,8 +63,8 @@ def steps_of(config: Config, frames: int, stage: str = "consolidate") -> Steps:
 def decide_work(config: Config, ingest: Path, steps: int | None) -> EqualWork:
     """Choose the work of all variants of a capture.
 
-    Settings that the recipe leaves open get the values for a run with every registered training frame
-    active.
+    Settings that the recipe leaves open get the values of a run that trains on every registered training
+    frame.
 
     Args:
         config: Configuration of the comparison's recipe.
@@ -147,7 +147,7 @@ def variant_config(
 
 
 def _settings(plain: Config, variant: Variant, work: EqualWork) -> list[str]:
-    """Return the settings that give ``variant`` equal work; schedules depend on shares of the steps."""
+    """Return the settings that give ``variant`` equal work, with the share of the steps of each training."""
     own = steps_of(plain, work.frames)
     spent = split_steps(own, variant.stage, work.steps)
     lines = [f"g0.sh_degree={work.sh_degree}", f"g0.budget={work.budget}"]

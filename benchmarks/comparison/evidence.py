@@ -1,4 +1,4 @@
-"""Make the captures, scenes and comparisons that support the page of results.
+"""Make the captures, scenes and comparisons behind the pages of results (together: the evidence).
 
 ``evidence.toml`` lists the fixed test set and the sections of the page. Every section is a comparison like
 those of ``compare``. All sections share one folder and one store, so that an interrupted call can be resumed.
@@ -41,13 +41,13 @@ WORLD_SETTINGS = (
     "g0.budget=100000",
     "ingest.max_frames=60",
 )
-"""Settings of a scene that serves as a world: it trains on every frame and runs the full schedule."""
+"""Settings of a scene that is the world of synthetic captures: it uses every frame and the full schedule."""
 
 Seed = Annotated[int, Field(ge=0)]
 
 
 class TestSet(FrozenModel):
-    """Captures on which no default may be chosen."""
+    """Captures that may not be used to choose defaults."""
 
     __test__ = False  # pytest must not collect it
 
@@ -58,7 +58,7 @@ class TestSet(FrozenModel):
 
 
 class TuningSet(FrozenModel):
-    """Captures on which defaults may be chosen."""
+    """Captures that may be used to choose defaults."""
 
     rooms_below: int = Field(ge=1)
     """Rooms with a smaller seed belong to the tuning set."""
@@ -79,7 +79,7 @@ class Section(FrozenModel):
     """Width and height in px; for a video, the larger one limits the longer side."""
     steps: int = Field(ge=1)
     factors: tuple[int, ...] = (1,)
-    """Multiples of ``steps``; with several, each gets its own columns."""
+    """Multiples of ``steps``. If there are several, each has separate columns in the tables."""
     variants: tuple[str, ...]
     settings: tuple[str, ...] = ()
     align_colour: bool = False
@@ -88,7 +88,7 @@ class Section(FrozenModel):
 
 
 class Evidence(FrozenModel):
-    """``evidence.toml``."""
+    """Content of ``evidence.toml``."""
 
     test: TestSet
     tuning: TuningSet

@@ -70,7 +70,7 @@ class Comparison:
             "choices": self.choices,
         }
         return {
-            # JSON text writes infinite figures as strings.
+            # pydantic's JSON has strings for infinite figures.
             **{name: [json.loads(item.model_dump_json()) for item in found] for name, found in lists.items()},
             "failures": self.failures,
         }

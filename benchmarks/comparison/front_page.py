@@ -37,12 +37,12 @@ FAULTS: Mapping[str, str] = {
 
 BASELINE = "all-view"
 SECTIONS = ("default-length-aligned", "default-length")
-"""Sections of the front page. A protocol is taken from the first one that has it."""
+"""Sections of the front page. The first one with a protocol gives the row of the protocol."""
 
 
 @dataclass(frozen=True)
 class FaultRow:
-    """Means of one protocol, and the gain of the whole method over training on all frames alike."""
+    """Means of one protocol, and the gain of the whole method over training on all frames with weight 1."""
 
     fault: str
     before: tuple[float, float | None]
@@ -94,7 +94,7 @@ def fault_table(found: Sequence[SavedSection]) -> str:
 
 
 def without_digest(text: str) -> str:
-    """Return a text with versions without the digests of their sources, for readers."""
+    """Remove the digests of the sources after the versions in ``text``: readers do not need them."""
     return re.sub(r", source \w+", "", text)
 
 

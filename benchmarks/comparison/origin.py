@@ -13,7 +13,7 @@ _DIGITS = 12
 
 
 def version_of_source() -> str:
-    """Return the package's version, the description by git in a checkout, and a digest of the source."""
+    """Return the package's version, ``git describe`` of the checkout if any, and a digest of the source."""
     described = _git_describe(Path(str(files("cleargs"))).parent)
     parts = [cleargs.__version__, *([described] if described else []), f"source {_digest()}"]
     return ", ".join(parts)

@@ -261,7 +261,7 @@ def _write_pose(
     figures: dict[str, list[tuple[str, str]]] = {}
     for layer, cell, evaluation in pose.renders:
         image = next((image for image in evaluation.images if image.name == pose.view.name), None)
-        if image is None:  # runs whose references differ
+        if image is None:  # this run has other references
             continue
         images[layer] = read_rgb(out / cell.evaluation / f"{pose.view.name}.png")
         notes[layer] = _note(image.values)

@@ -97,7 +97,7 @@ def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet,
 
 
 def _escape_dollars(name: str) -> str:
-    """Escape dollar signs: matplotlib reads text between two of them as a formula."""
+    """Escape dollar signs: matplotlib reads text between two dollar signs as a formula."""
     return name.replace("$", r"\$")
 
 
@@ -145,8 +145,8 @@ def comparison_sheet(
 def _typical_frame(out: Path, cell: Cell, capture: Path) -> str:
     """Return the name of a bad frame that is not the worst one.
 
-    It is at the upper quartile of the input's error against the truth. Without truth, it is at the lower
-    quartile of the scene's PSNR.
+    Its error against the truth is at the upper quartile of the input frames. Without truth, its PSNR in the
+    scene is at the lower quartile.
     """
     truth, observed = capture / "truth" / "observed" / "images", capture / "images"
     evaluation = Evaluation.model_validate_json((out / cell.evaluation / "eval.json").read_bytes())

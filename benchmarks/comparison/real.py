@@ -28,13 +28,13 @@ from cleargs.progress import Reporter
 from cleargs.safe_io import read_bytes, read_text
 
 SHOWCASE = "blurball"
-"""Scene of the picture: its licence (CC BY 4.0) allows to show it."""
+"""Scene in the example picture. Its licence (CC BY 4.0) allows publication."""
 SHOWN = "001"
-"""Stem of the blurred photograph of the picture, next to the first held-out view."""
+"""Stem of the blurred photograph in the example picture. The other images show the first held-out view."""
 REFINE_STEPS = 15
-"""Steps of fitting each test pose for the second figures."""
+"""Number of steps that fit each test pose for the metrics of `REFINED`."""
 REFINED = {"psnr": "psnr_refined", "lpips_alex": "lpips_alex_refined"}
-"""Names of the metrics with fitted test poses."""
+"""Metric -> its name when the test poses were fitted to the test images first."""
 
 SHORT, FULL = "real", "real-full"
 """Names of the places for the two tables in a page."""
@@ -51,7 +51,7 @@ class RealScene(FrozenModel):
     shows: str
     """Content and quality of the capture, for readers."""
     capture: str
-    """Place in the folder of the captures."""
+    """Path in the folder of the captures."""
     settings: tuple[str, ...]
     steps: int | None = Field(None, ge=1)
     protocol: str
@@ -68,7 +68,7 @@ class Published(FrozenModel):
     source: str
     protocol: str
     second_hand: bool = False
-    """Not read in the paper or its log, but in another text."""
+    """True if the figures were read in another text than the paper or its log."""
 
 
 class RealList(FrozenModel):
@@ -101,7 +101,7 @@ def run_scenes(
     store: Store,
     reporter: Reporter,
 ) -> Comparison:
-    """Train and evaluate each variant on each scene; what an earlier call finished is reused.
+    """Train and evaluate each variant on each scene; results of an earlier call are reused.
 
     Args:
         out: Folder of the benchmark.
@@ -145,7 +145,7 @@ def run_scenes(
 
 
 class Trainings(Figures):
-    """Results of one variant on one scene, a cell per seed."""
+    """Results of one variant on one scene: one cell per seed."""
 
     version: str
     """Version of the source that made them."""
@@ -153,12 +153,12 @@ class Trainings(Figures):
 
 
 class RealResults(Figures):
-    """``OUT/real.json``: results of all scenes and variants, which may be of several calls."""
+    """Content of ``OUT/real.json``: results of all scenes and variants, which may come from several calls."""
 
     scenes: dict[str, dict[str, Trainings]] = Field(default_factory=dict)
     """Scene -> variant -> results."""
     failures: tuple[str, ...] = ()
-    """Reasons for what the last call could not make."""
+    """Names of the scenes that the last call could not make, with the reason."""
 
     def with_results(self, found: Comparison, version: str) -> RealResults:
         """Return the results of ``found``, and all others that an earlier call has stored."""
@@ -180,7 +180,7 @@ class RealResults(Figures):
 
 
 def read_results(path: Path) -> RealResults:
-    """Read ``real.json``; without the file, or from a file of another form, nothing is read."""
+    """Read ``real.json``; return empty results if the file is missing or has another form."""
     try:
         return RealResults.model_validate_json(read_bytes(path))
     except (OSError, ValidationError):
@@ -323,7 +323,7 @@ def _published(one: Published) -> list[str]:
 
 
 def showcase(path: Path, out: Path, found: Comparison) -> bool:
-    """Write a row of `SHOWCASE`: blurred photograph, all frames alike, ClearGS, sharp reference.
+    """Write an image of `SHOWCASE`: blurred photograph, all frames alike, ClearGS, sharp reference, in a row.
 
     Returns:
         False if its scenes were not made.

@@ -40,10 +40,10 @@ _QUICK = "This is the quick page (`--quick`): small images, short trainings, few
 
 @dataclass(frozen=True)
 class Origin:
-    """Command and list from which a page is made."""
+    """Command and list of sections from which a page is made."""
 
     command: str
-    """Command without names of sections."""
+    """The command, without its options ``--section``."""
     recipe: str
     quick: bool
     sections: tuple[Section, ...]

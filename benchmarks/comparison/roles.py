@@ -1,4 +1,4 @@
-"""Number of frames of a scene by role; it shows which mechanisms of RVA a table exercises."""
+"""Number of frames of a scene by role. It shows which rules of RVA have an effect in a table."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ def save_section(folder: Path, found: SectionOutcome, version: str, machine: str
 def read_sections(folder: Path, sections: Iterable[Section], reporter: Reporter) -> list[SavedSection]:
     """Read the results of ``sections`` from ``folder``.
 
-    Unreadable files are left out with a warning. A file of another list is read with one: its figures hold
-    for the captures and settings that are stored in it.
+    Unreadable files are left out with a warning. A file from another list of evidence is read, with a
+    warning: its figures are valid for the captures and settings that are stored in it.
     """
     found = []
     for section in sections:

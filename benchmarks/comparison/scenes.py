@@ -318,8 +318,8 @@ def cached_evaluation(
 ) -> tuple[Evaluation, Path]:
     """Return the evaluation of a scene on a set of views, and its folder with the renders.
 
-    An earlier evaluation is reused if nothing changed. The digests of metric weights count too: some may have
-    been installed since.
+    An earlier evaluation is reused if nothing changed. The digests of the metrics' weights are compared too,
+    because some weights may have been installed since.
     """
     from cleargs.evaluate.evaluate import evaluate_scene
     from cleargs.evaluate.references import reference_of

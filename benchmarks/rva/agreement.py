@@ -1,4 +1,4 @@
-"""Rank agreement of two evaluators on the frames of a capture, and their largest disagreements."""
+"""Rank agreement of two evaluators of frames: R (reliability), B (risk of degradation) and each cue."""
 
 from __future__ import annotations
 

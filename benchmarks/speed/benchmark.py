@@ -33,7 +33,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.pace import random_scene
 
 RASTERISER = ("rasterise.forward", "rasterise.backward", "gradients.backpropagate")
-"""Kernels of ClearGS in the comparison of rasterisers. The last one sums the pairs per Gaussian, as autograd
+"""Kernels of ClearGS in the comparison of rasterisers. The last one adds the pairs' gradients, as autograd
 does for torch. It also computes gradients of the raw parameters, which torch does not."""
 
 

@@ -1,6 +1,6 @@
 """Cost of image formation in a training step, and its error against the true exposure.
 
-It is compared with the other way to put blur into the loss: the mean of N renders along the path, as in
+It is compared with the usual way to include blur in the loss: the mean of N renders along the path, as in
 "BAD-Gaussians" (Zhao et al. 2024) and "Deblur-GS" (Chen & Liu 2024).
 """
 
@@ -84,7 +84,7 @@ class FormationBenchmark:
 
 
 def plan_of(*, quick: bool, threads: int) -> FormationPlan:
-    """Return the plan to quote, or with ``quick`` a small one of the same kind."""
+    """Return the plan whose figures may be quoted, or with ``quick`` a small one to try the command."""
     if quick:
         return FormationPlan(2_000, 96, 54, (3.0, 10.0), (3, 9), threads, rounds=2, repetitions=1)
     return FormationPlan(threads=threads)

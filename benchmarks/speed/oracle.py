@@ -22,7 +22,7 @@ from cleargs.splat.gaussians import Gaussians
 MAX_PIXELS = 1000
 """Maximum number of random pixels that the oracle renders."""
 MAX_PRODUCTS = 50_000_000
-"""Maximum number of (Gaussian, pixel) products, as if every Gaussian were visible. It takes half a minute."""
+"""Maximum number of (Gaussian, pixel) products, counting all Gaussians. They take half a minute."""
 MARGIN = 1e-3
 """Relative distance of an alpha from 1/255, or of a transmittance from 1e-4, below which a pixel is left out:
 the image is discontinuous there, and float32 may fall on the other side. A mean at x = 1000 px has an error
@@ -64,7 +64,7 @@ class Truth:
     """Values of the oracle for some pixels of a view."""
 
     pixels: Tensor  # [S] y * width + x
-    safe: Tensor  # [S] bool: not within MARGIN of a cut-off
+    safe: Tensor  # [S] bool: farther than MARGIN from a cut-off
     colours: Tensor  # [S, 3] float64
     grad_image: Tensor  # [H, W, 3] float32, zero except at safe pixels; loss = sum(grad_image * image)
     gradients: Gaussians  # float64, of all Gaussians

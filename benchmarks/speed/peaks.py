@@ -20,7 +20,7 @@ FMA_STEPS = 500_000
 COPY_BYTES = 256 << 20
 """Size of the copied arrays: many times a last-level cache."""
 SLICES = 32
-"""Parts of the arrays, copied one per repeat. A part has left the cache before its next repeat."""
+"""Parts of the arrays. Each repeat copies the next part, so a part has left the cache when its turn comes."""
 BLOCKS = 64
 """Units of work of the parallel copy."""
 HALF = np.float32(0.5)

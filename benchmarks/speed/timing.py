@@ -1,6 +1,6 @@
 """Timing on a noisy machine: variants run alternately in one process, and medians and quartiles are reported.
 
-So other load affects all variants alike. The ratio of two variants is taken within each round.
+Other load on the machine then affects all variants alike. The ratio of two variants is taken in each round.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A tile rasteriser in pure torch with autograd, with which the kernels are compared.
 
 Per tile it does the same arithmetic as gsplat's torch code (``_torch_impl.accumulate``), dense over the
-pixels and splats of the tile, with the cut-offs of our rasteriser. It is fast for code of this kind:
+pixels and splats of the tile, with the cut-offs of our rasteriser. It is fast for pure torch:
 
 * The lists of splats per tile are computed before timing starts, and are minimal: a splat is in a list only
   if its alpha reaches 1/255 at a pixel of the tile.
@@ -21,8 +21,8 @@ from cleargs.splat import constants
 
 TILE = 16
 GROUP_PRODUCTS = 1 << 19
-"""Approximate number of (pixel, splat) products per group of tiles: 2 MB per tensor. The fastest of 2^15 to
-2^21."""
+"""Approximate number of (pixel, splat) products per group of tiles: 2 MB per tensor. It is the fastest value
+from 2^15 to 2^21."""
 
 
 class TileGroup(NamedTuple):

@@ -4,7 +4,7 @@
 
     BATCH/scenes/NAME/       run folders, as `cleargs run` makes them
     BATCH/store/             one store for all scenes: equal results are shared
-    BATCH/exports/           exported scenes and films, where the sheet asks for them
+    BATCH/exports/           exported scenes and films, if the sheet requests them
     BATCH/logs/NAME.log      the output of the last attempt
     BATCH/summary.csv        one row per scene
     BATCH/report/index.html  a page with all scenes
@@ -52,11 +52,11 @@ class Result:
     psnr_unseen: float | None
     """PSNR of the last scene on pixels that no training saw, in dB."""
     minutes: float
-    """Time of all stages."""
+    """Total time of all stages."""
     memory_gb: float
-    """Peak memory of all stages, 1e9 bytes."""
+    """Largest peak memory of a stage, GB (1e9 bytes)."""
     disk_gb: float
-    """Size of all results, 1e9 bytes."""
+    """Size of all results, GB (1e9 bytes)."""
     cause: str
     """Cause of the failure, or missing outputs."""
 
@@ -90,7 +90,7 @@ class Batch:
     options: tuple[str, ...] = ()
     """More options for each ``cleargs run``."""
     falls_back: bool = False
-    """True if ``--device auto`` chose the GPU: a scene on which its kernels fail continues on the CPU."""
+    """True if ``--device auto`` chose the GPU: a scene on which the GPU kernels fail continues on the CPU."""
 
     def run_folder(self, scene: SceneJob) -> Path:
         return self.folder / "scenes" / scene.name
@@ -121,7 +121,7 @@ class Batch:
                 run = self._run(scene)
                 with opened_store(run.store) as store:
                     check_same_input(run, self.dag, store)
-                for stage in self.dag.until(self.until)[1:]:  # the first one's files are the capture
+                for stage in self.dag.until(self.until)[1:]:  # not ingest, whose files are the capture
                     self.dag.load(stage).externals(run.config.effective[stage], run.source)
                 for ending in set(scene.after.export) - set(TARGETS):
                     from cleargs.splat.formats import format_of  # loads torch
@@ -139,7 +139,7 @@ class Batch:
             return Planner(self.dag, run, store, usable_cores(), SilentReporter()).plan(self.until)
 
     def run(self, scene: SceneJob, reporter: Reporter) -> None:
-        """Run ``scene`` and the work after it, each in a separate process. `log` gets their output."""
+        """Run ``scene`` and the work after it, each in a separate process. Write their output to `log`."""
         self.log(scene).parent.mkdir(parents=True, exist_ok=True)
         self.log(scene).write_text("", "utf-8")
         if self._call(scene, self.arguments(scene), reporter) == 0:
@@ -252,7 +252,7 @@ class Batch:
 
 
 def program() -> list[str]:
-    """Return the command that starts ``cleargs``, which does not need its script next to the interpreter."""
+    """Return a command that starts ``cleargs`` even if its script is not next to the interpreter."""
     return module_command("cleargs")
 
 

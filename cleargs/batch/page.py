@@ -78,7 +78,7 @@ def _card(batch: Batch, scene: SceneJob, result: Result, report: Path, side: int
 def _picture(
     run: Path, made: Mapping[str, Manifest], report: Path, name: str, side: int
 ) -> tuple[ImageFile | None, str]:
-    """Return a picture, and a label for it: the still of the scene's report, or else the first frame."""
+    """Write the still of the scene's report, or else the first frame. Return the file and a label for it."""
     still = run / FOLDER / "scene.jpg"
     with suppress(CleargsError):  # a damaged picture must not hide the scene
         if still.is_file():

@@ -18,13 +18,13 @@ from cleargs.pipeline.settings import flattened
 from cleargs.safe_io import faults_as, read_text
 
 NAMES = "letters, digits, and _ . - after the first, at most 100"
-"""Description of a valid name for a message."""
+"""Rule for the name of a scene, for messages."""
 PLAIN = ("name", "input", "recipe")
 """Columns of a CSV sheet that are not settings."""
 
 
 class SheetError(InputError):
-    """A sheet with mistakes. ``problems`` has a line for each, with its place in the sheet."""
+    """A sheet with mistakes. ``problems`` has one line per mistake, with its place in the sheet."""
 
     def __init__(self, path: Path, problems: list[str]) -> None:
         mistakes = "1 mistake" if len(problems) == 1 else f"{len(problems)} mistakes"
@@ -44,7 +44,7 @@ class After(FrozenModel):
 
 
 class SheetRow(FrozenModel):
-    """A scene as it is in the sheet, with the defaults of the sheet filled in."""
+    """A scene of the sheet, with the sheet's defaults filled in."""
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
     input: Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]

@@ -1,4 +1,4 @@
-"""Adjustment of poses, points and cameras to the features, judged by matches that take no part in it."""
+"""Adjustment of poses, points and cameras to the features, measured on matches that it does not use."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
 """Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
 terms."""
 
-_SIMPLE = {"SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS}  # models with no distortion that `FIRST_LENS` lacks
+_SIMPLE = {"SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS}  # models without distortion terms that `FIRST_LENS` lacks
 
 SHARED_BY = 8
-"""Fewest frames per camera from which cameras of the input are adjusted with its poses."""
+"""Minimum number of frames per camera to adjust the cameras of the input, not only its poses."""
 
 _ROUNDS = 4
 _TOLERANCE = 1e-5
@@ -28,30 +28,30 @@ _TOLERANCE = 1e-5
 poses."""
 
 _LENS_GAIN = 0.04
-"""`FULL_LENS` is taken where it lowers the mean error of the matches that were kept out by at least this
-share (docs/experiments/poses.md)."""
-
-_LENS_FRAMES = 150
-"""Most frames that measure the lens, evenly spread. The time of an adjustment grows faster than their number
+"""`FULL_LENS` is chosen if it lowers the mean error of the kept-out matches by at least this share
 (docs/experiments/poses.md)."""
 
-_CAPPED_PX = 4.0
-"""Errors count up to this in means: COLMAP takes a match for right within 4 px of its epipolar line."""
+_LENS_FRAMES = 150
+"""Maximum number of frames, evenly spread, to choose the lens. The time of an adjustment grows faster than
+this number (docs/experiments/poses.md)."""
 
-_FARTHEST_PX = 1e4  # stands for an error that is not finite
-_HELD_BY = 15  # fewest points that a frame must see to take part in an adjustment
+_CAPPED_PX = 4.0
+"""Means cap each error at this value: COLMAP accepts a match within 4 px of its epipolar line."""
+
+_FARTHEST_PX = 1e4  # larger errors, also infinite ones, count as this
+_HELD_BY = 15  # minimum number of points in a frame that keeps its adjusted pose
 
 
 class Adjuster:
-    """Adjusts models to the matches in a database but every tenth track, and measures errors on these."""
+    """Adjusts models to all matches in a database except every tenth track. These tracks measure errors."""
 
     def __init__(
         self, database: Path, triangulate: Callable[[pycolmap.Reconstruction, Path], pycolmap.Reconstruction]
     ) -> None:
-        """Copy ``database``, which stays as it is, without the tracks that are kept out.
+        """Copy ``database``, which does not change, without the tracks that are kept out.
 
-        ``floor`` is the `median_error` if each pair of frames has a separate geometry. ``triangulate`` gives
-        a model new points, from the matches in a database.
+        ``floor`` is the `median_error` with a separate geometry for each pair of frames. ``triangulate``
+        triangulates the points of a model again from the matches in a database.
         """
         self._cut = database.with_name(f"{database.stem}-cut.db")
         copy_without_features(database, self._cut, [])
@@ -59,9 +59,9 @@ class Adjuster:
         self._triangulate = triangulate
 
     def errors(self, model: pycolmap.Reconstruction) -> NDArray[np.float64]:
-        """Return how far the matches that are kept out are from their epipolar lines, px of the images.
+        """Return the distances of the kept-out matches from their epipolar lines, px of the working images.
 
-        Those of frames without a pose do not count.
+        Matches of frames without a pose do not count.
         """
         placed = {key: image for key, image in model.images.items() if image.has_pose}
         found = epipolar_errors(
@@ -72,23 +72,23 @@ class Adjuster:
         return np.asarray(np.minimum(found, _FARTHEST_PX))
 
     def median_error(self, model: pycolmap.Reconstruction) -> float:
-        """Return the median of `errors`; 0 where no match was kept out."""
+        """Return the median of `errors`; 0 if no match was kept out."""
         return _median(self.errors(model))
 
     def mean_error(self, model: pycolmap.Reconstruction) -> float:
-        """Return the mean of `errors` up to `_CAPPED_PX`, which counts single frames that are wrong, too."""
+        """Return the mean of the capped `errors`. Unlike the median, it shows single wrong frames."""
         errors = np.minimum(self.errors(model), _CAPPED_PX)
         return float(errors.sum() / max(1, len(errors)))
 
     def refine(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction | None:
         """Return ``model`` with poses, points and, with ``cameras``, lenses adjusted.
 
-        None where few points hold every frame.
+        Returns None if every frame sees too few points.
         """
         refined = copy.deepcopy(model)
         if cameras and {camera.model.name for camera in refined.cameras.values()} <= _SIMPLE:
             set_lens(refined, FIRST_LENS)
-        # At better poses more features find their points, so both are done in turn.
+        # At better poses more features find their points: adjustment and triangulation alternate.
         for _ in range(_ROUNDS):
             refined = self._adjusted(refined, cameras=cameras)
         if cameras and lens_of(refined) == FIRST_LENS:
@@ -97,13 +97,13 @@ class Adjuster:
         return _anchored(refined, model, held) if held else None
 
     def adjust(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
-        """Return a model that all matches made, adjusted without those that are kept out."""
+        """Return ``model``, which all matches made, after an adjustment without the kept-out matches."""
         adjusted = self._adjusted(self._triangulate(copy.deepcopy(model), self._cut), cameras=cameras)
         placed = [image for image in adjusted.images.values() if image.has_pose]
         return _anchored(adjusted, model, _held(adjusted) or placed)
 
     def with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Return ``model``, with `FULL_LENS` where it explains the matches that are kept out better."""
+        """Return ``model``, with `FULL_LENS` if this lens explains the kept-out matches better."""
         if lens_of(model) != FIRST_LENS:
             return model
         start = self.adjust(_thinned(model), cameras=True)
@@ -128,7 +128,7 @@ class Adjuster:
         options = pycolmap.BundleAdjustmentOptions(
             refine_focal_length=cameras, refine_extra_params=cameras, print_summary=False
         )
-        # Wrong matches are still among them.
+        # A robust loss, because some matches are still wrong.
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.solver_options.num_threads = 1
         options.ceres.solver_options.function_tolerance = _TOLERANCE
@@ -142,7 +142,7 @@ def lens_of(model: pycolmap.Reconstruction) -> str:
 
 
 def set_lens(model: pycolmap.Reconstruction, lens: str) -> None:
-    """Make all cameras of ``model`` cameras of ``lens``; focal length, centre and first radial term stay."""
+    """Change all cameras to the camera model ``lens``; focal length, centre and first radial term stay."""
     for camera in model.cameras.values():
         focal = camera.mean_focal_length()
         radial = float(camera.params[3]) if camera.model.name == FIRST_LENS else 0.0
@@ -173,18 +173,18 @@ def _median(errors: NDArray[np.float64]) -> float:
 def lay_over(
     model: pycolmap.Reconstruction, given: pycolmap.Reconstruction, held: Collection[pycolmap.Image]
 ) -> None:
-    """Lay ``model`` over the cameras of ``given`` by the similarity that fits its images ``held`` best.
+    """Transform ``model`` by the similarity that maps its images ``held`` best to the cameras of ``given``.
 
-    The axes count too, as the centres of a straight path leave the turn about it open.
+    The camera axes count too, because the centres of a straight path do not fix the rotation about it.
     """
     before = {image.name: image for image in given.images.values()}
     found = pycolmap.estimate_sim3d(_marks(held), _marks([before[image.name] for image in held]))
-    assert found is not None  # four marks of a camera fix one
+    assert found is not None  # the four points of one camera determine a similarity
     model.transform(found)
 
 
 def _marks(images: Collection[pycolmap.Image]) -> NDArray[np.float64]:
-    """Return the centres of cameras, and the points one scene's size along their axes, [4 N, 3]."""
+    """Return per camera its centre, and the three points at the scene's size along its axes, [4 N, 3]."""
     centres = np.stack([image.projection_center() for image in images])
     size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     axes = np.stack([image.cam_from_world().rotation.matrix() for image in images])
@@ -198,9 +198,9 @@ def _held(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 def _anchored(
     model: pycolmap.Reconstruction, given: pycolmap.Reconstruction, held: Collection[pycolmap.Image]
 ) -> pycolmap.Reconstruction:
-    """Lay ``model`` over ``given``, which has the same frames; frames that few points hold get its poses.
+    """Return ``model`` in the world of ``given``. Frames that are not in ``held`` get their given poses.
 
-    The features leave place, turn and size of the whole open.
+    The features do not determine position, rotation and scale of the whole. Both models have the same frames.
     """
     lay_over(model, given, held)
     names = {image.name for image in held}

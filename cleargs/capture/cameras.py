@@ -1,8 +1,8 @@
 """Cameras and poses in COLMAP's conventions, and the normalised world.
 
 The normalised world has its origin at the mean camera centre, the farthest camera at distance 1, and the mean
-up direction along -y. Distortion is pycolmap's (all COLMAP models). Only its camera mathematics is called in
-this process, on checked parameters, because COLMAP's failed checks would end the process.
+up direction along -y. pycolmap computes distortion. This module calls only the camera functions of pycolmap,
+with checked parameters, because a failed check in COLMAP ends the process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FISHEYE = frozenset(
     {"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FOV"}
 )
 _MODELS = _FISHEYE | {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
-"""COLMAP models that are supported; those of `_FISHEYE` bend lines even without distortion."""
+"""Supported COLMAP models. Those of `_FISHEYE` bend straight lines even if all distortion terms are 0."""
 
 MAX_PARAMETER, MIN_FOCAL = 1e9, 1e-3
 """Largest camera parameter, and shortest focal length in pixels. Beyond them pixels and rays overflow."""
@@ -94,7 +94,7 @@ class Intrinsics:
         return Intrinsics(self.model, width, height, tuple(camera.params.tolist()))
 
     def colmap(self) -> pycolmap.Camera:
-        """As pycolmap has it (loaded when it is first needed: every run looks up its inputs)."""
+        """Return the pycolmap camera. The import is here, so that inputs can be looked up without it."""
         from cleargs.capture.colmap import pycolmap
 
         return pycolmap.Camera(
@@ -107,7 +107,7 @@ def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float)
 
 
 def guessed_camera(model: str, width: int, height: int) -> Intrinsics:
-    """COLMAP's first guess for a frame that has no camera: focal length 1.2 long sides, no distortion."""
+    """Return COLMAP's first guess without a known camera: focal length 1.2 long sides, no distortion."""
     from cleargs.capture.colmap import pycolmap
 
     focal = 1.2 * max(width, height)
@@ -129,19 +129,19 @@ class Pose:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """w, x, y, z with w >= 0."""
+        """Rotation as a unit quaternion w, x, y, z with w >= 0."""
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat(canonical=True)
         return float(w), float(x), float(y), float(z)
 
     def with_flipped_axes(self) -> Pose:
-        """Return the pose that an OpenGL camera-to-world matrix has if its axes are meant as OpenCV's."""
+        """Return the pose for OpenCV axes in the matrix of the input, which was read with OpenGL axes."""
         rotation = _FLIP @ self.rotation
         return Pose(rotation, -rotation @ self.centre)
 
     def inverted(self, *, flip: bool) -> Pose:
-        """Return the pose that an OpenGL camera-to-world matrix has if it is meant as world to camera.
+        """Return the pose for a world-to-camera matrix in the input, which was read as camera to world.
 
-        With ``flip`` its axes are OpenGL's, else OpenCV's.
+        With ``flip``, the matrix has OpenGL axes, else OpenCV axes.
         """
         rotation, translation = self.rotation.T @ _FLIP, self.centre
         return Pose(_FLIP @ rotation, _FLIP @ translation) if flip else Pose(rotation, translation)
@@ -153,16 +153,16 @@ class Pose:
 
 
 def within_reach(numbers: NDArray[np.float64]) -> bool:
-    """Return True if all are finite and no larger than `MAX_COORDINATE`."""
+    """Return True if all ``numbers`` are finite and at most `MAX_COORDINATE` in magnitude."""
     return bool(np.isfinite(numbers).all() and np.abs(numbers).max(initial=0.0) <= MAX_COORDINATE)
 
 
 def rigid_pose(camera_to_world: NDArray[np.float64], name: str, hint: str) -> Pose:  # [3 or 4, 4]
     """Return the pose of a camera-to-world matrix with OpenGL axes (x right, y up, z back).
 
-    Printed poses are orthonormal to a few digits only, and some writers leave a scale in. The nearest
-    rotation is taken. ``name`` of the frame and ``hint`` are for the InputError, which is raised for NaN, a
-    coordinate above `MAX_COORDINATE`, a mirror image, or axes whose lengths differ by more than 5 %.
+    The nearest rotation is used: printed poses are orthonormal to a few digits only, and some writers leave
+    a scale in them. ``name`` of the frame and ``hint`` are texts of the InputError, which is raised for NaN,
+    a coordinate above `MAX_COORDINATE`, a mirror image, or axes whose lengths differ by more than 5 %.
     """
     if not within_reach(camera_to_world):
         raise InputError(f"the pose of {name} is not finite, or out of reach", hint=hint)
@@ -193,7 +193,7 @@ class Similarity:
         return Pose(rotation, -rotation @ self.points(pose.centre[None])[0])
 
     def then(self, after: Similarity) -> Similarity:
-        """Return the similarity that does this one, then ``after``."""
+        """Return the similarity that applies this one, then ``after``."""
         origin = self.origin + self.scale * self.rotation.T @ after.origin
         return Similarity(after.rotation @ self.rotation, origin, self.scale * after.scale)
 
@@ -208,7 +208,7 @@ class Similarity:
 
     @staticmethod
     def from_json(noted: Any, ingest: Path) -> Similarity:
-        """Return what `to_json` wrote into the manifest of ``ingest``. Raises InputError if it has none."""
+        """Return the similarity that `to_json` wrote into the manifest of ``ingest``, or raise InputError."""
         try:
             rotation, origin = (np.array(noted[name], np.float64) for name in ("rotation", "translation"))
             return Similarity(rotation.T, origin, float(noted["scale"]))
@@ -219,7 +219,7 @@ class Similarity:
 
 
 def normalise(poses: Sequence[Pose]) -> Similarity:
-    """Return the similarity that normalises the world of cameras; InputError if all are at one place."""
+    """Return the similarity to the normalised world. Raises InputError if all cameras are at one place."""
     centres = np.stack([pose.centre for pose in poses])
     origin = centres[0] + (centres - centres[0]).mean(axis=0)
     scale = float(np.linalg.norm(centres - origin, axis=1).max())
@@ -235,8 +235,8 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
 def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the smallest rotation that takes ``up`` to -y.
 
-    Near +y, the axis of the smallest rotation depends on rounding errors. There a half turn about x comes
-    first.
+    If ``up`` is near +y, the axis of the smallest rotation depends on rounding errors. Then a half turn about
+    x comes first.
     """
     length = float(np.linalg.norm(up))
     if length < 1e-6:

@@ -58,13 +58,13 @@ class Capture:
 
 
 class Layout(Protocol):
-    """Reader of one kind of input, for example a module.
+    """Reader of one kind of input: a module, or an object with these methods.
 
     A layout of another package is chosen by name and needs no ``detect``.
     """
 
     def detect(self, source: Path, *, poses: bool) -> bool:
-        """Return True if ``source`` has this layout, by names. Without ``poses``, no file of poses counts."""
+        """Return True if file names in ``source`` show this layout. Without ``poses``, ignore pose files."""
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:
         """Return all files that are read, by role: a file, a folder, or single files by name.

@@ -1,8 +1,8 @@
-"""Work in a child process that reports progress, can be killed, and may abort without taking us along.
+"""Work in a child process that reports progress, can be killed, and may abort without ending this process.
 
 The child writes JSON objects, one per line, to its standard output. ``{"phase": label, "total": n}`` opens a
 phase, ``{"done": k}`` advances it, ``{"error": cause, "hint": remedy}`` reports a failure. Its standard error
-(COLMAP's log) goes to a file. The child and the processes that it started end with its parent: it watches its
+(COLMAP's log) goes to a file. The child and its own children end with the parent: the child watches its
 standard input, whose other end closes when the parent ends for any reason.
 """
 
@@ -25,14 +25,14 @@ from cleargs.files import disk_error
 from cleargs.progress import Reporter, Task
 from cleargs.subprocesses import module_command
 
-_FULL = 8 * 2**20  # a disk with fewer free bytes is full: SQLite writes its pages in blocks of up to some MB
+_FULL = 8 * 2**20  # a disk with fewer free bytes counts as full: SQLite writes blocks of up to some MB
 
 
 def reports_to_parent() -> Callable[..., None]:
-    """Take standard output for reports alone, and return the function that sends one, given by name.
+    """Reserve standard output for reports. Return a function that sends its keyword arguments as a report.
 
-    Other output of libraries goes to the log. From now on the group of this process ends when its parent
-    ends.
+    The output of libraries goes to the log. From now on, the process group of this process ends when its
+    parent ends.
     """
     reports = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
@@ -50,9 +50,9 @@ def _die_with_parent() -> None:
 def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
     """Run ``python -P -m module job`` to its end, showing its progress.
 
-    If this call ends early (Ctrl-C above all), the child and what it started are killed first. Raises
-    StageError with the child's cause, or with the last failed check in ``log`` when it aborted, and
-    StoreError if the disk is full.
+    If this call ends early (for example by Ctrl-C), the child and its own children are killed first. Raises
+    StageError with the cause that the child reported, or with the last failed check in ``log`` if the child
+    aborted, and StoreError if the disk is full.
     """
     # Sums in COLMAP's and numpy's linear algebra must not depend on threads.
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -72,9 +72,9 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
             failure = _follow(child, reporter)
             status = child.wait()
         finally:
-            with suppress(OSError):  # none of them is left
+            with suppress(OSError):  # the processes have ended
                 os.killpg(child.pid, signal.SIGKILL)
-    # On a full disk, COLMAP and SQLite fail at whatever they were doing.
+    # On a full disk, COLMAP and SQLite fail with unrelated messages.
     if status != 0 and shutil.disk_usage(log.parent).free < _FULL:
         raise disk_error(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), log)
     if failure is not None:
@@ -88,7 +88,7 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
 
 
 def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | None:
-    """Show the child's reports until it closes its output; the error that it named, if any."""
+    """Show the child's reports until it closes its output. Return the error that it reported, or None."""
     assert child.stdout is not None
     failure: StageError | None = None
     with ExitStack() as phases:

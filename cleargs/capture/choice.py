@@ -1,4 +1,4 @@
-"""Choice of frames: of a video, the sharpest near each chosen time; of all, those held out for testing."""
+"""Choice of frames: the sharpest frame of a video near each chosen time, and the held-out test frames."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 
 
 def select_sharp_frames(capture: Capture, long_side: int, reporter: Reporter) -> Capture:
-    """Return ``capture`` with each frame of a video exchanged for the sharpest of its stretch of time.
+    """Return ``capture`` with each frame of a video replaced by the sharpest of its stretch of time.
 
-    The stretch of a frame is all frames that are nearer to its time than to that of another. Ties go to the
-    earlier one. Each video is decoded once.
+    The stretch of a frame of ``capture`` is all frames of the video that are nearer in time to it than to the
+    other ones. Ties go to the earlier frame. Each video is decoded once.
     """
     if capture.kind != "video":
         return capture
@@ -37,7 +37,7 @@ def select_sharp_frames(capture: Capture, long_side: int, reporter: Reporter) ->
 
 
 def _sharpest_of(video: Path, capture: Capture, long_side: int, reporter: Reporter) -> list[SourceFrame]:
-    """Return the sharpest frames near those of ``capture`` that are from ``video``."""
+    """Return the sharpest frame of each stretch of ``video``."""
     frames = [frame for frame in capture.frames if frame.path == video]
     timeline = read_timeline(video).between(*capture.stretch)
     times = np.array([frame.pts for frame in frames], np.float64)
@@ -64,10 +64,10 @@ def _sharpest_of(video: Path, capture: Capture, long_side: int, reporter: Report
 
 
 def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
-    """Variance of the Laplacian of the grey image after a binomial filter (5x5, sigma 1 px); 0 and up.
+    """Return the variance (>= 0) of the Laplacian of the grey image after a 5x5 binomial filter, sigma 1 px.
 
-    It grows with the texture in view too, so it ranks neighbours, not a whole capture. Unfiltered it would
-    rank noise first. All values are whole numbers below 2^24, so the sums are exact.
+    It grows with the texture in view too, so it ranks neighbours, not a whole capture. Without the filter,
+    noise would rank first. All values are whole numbers below 2^24, so the sums are exact.
     """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     smooth = cv2.sepFilter2D(grey, cv2.CV_32F, _BINOMIAL, _BINOMIAL)
@@ -80,11 +80,11 @@ def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
 def held_out(
     rule: str, names: Sequence[str], read: Callable[[int], ImageU8], registered: Sequence[bool]
 ) -> set[int]:
-    """Return the numbers of the test frames by ``ingest.holdout``.
+    """Return the numbers of the test frames by the ``rule`` in ``ingest.holdout``.
 
     every:N holds out frames 0, N, 2N, ..., as Mip-NeRF 360 and 3DGS do with N = 8. sharpest:N holds out the
-    sharpest of every N ``registered`` frames in a row, also of the shorter rest, as 3dgs-deblur's
-    ``train_eval_split_by_blur_score.py`` does; ``read`` gives their images. Ties go to the earlier frame.
+    sharpest of every N ``registered`` frames in a row, also of the last, shorter group, as 3dgs-deblur's
+    ``train_eval_split_by_blur_score.py`` does. ``read`` returns an image. Ties go to the earlier frame.
     Raises InputError for unknown names, or if no registered frame is left for training.
     """
     kind, _, number = rule.partition(":")
@@ -105,12 +105,12 @@ def held_out(
 
 
 def holdout_hash(rule: str, names: Iterable[str]) -> str:
-    """SHA-256 over the rule and the sorted names of the test frames: equal for equal splits by one rule."""
+    """Return the SHA-256 of the rule and the sorted names of the test frames, which identifies the split."""
     return hashlib.sha256(json.dumps([rule, sorted(names)]).encode()).hexdigest()
 
 
 def _matching(item: str, names: Sequence[str]) -> list[int]:
-    """Frames of which path, file name or stem is ``item`` or fits it as a pattern (``*``, ``?``, ``[]``)."""
+    """Return numbers of frames whose path, name or stem is or matches ``item`` (``*``, ``?``, ``[]``)."""
     found = []
     for index, name in enumerate(names):
         spellings = (name, Path(name).name, Path(name).stem)

@@ -1,7 +1,7 @@
 """pycolmap, without the signal handler that importing it installs.
 
-Its glog catches SIGTERM, prints a stack trace and ends the process. All modules import pycolmap from here, so
-that the program's own handler of SIGTERM stays.
+Its logging library, glog, catches SIGTERM, prints a stack trace and ends the process. All modules import
+pycolmap from here, so that the program's own handler of SIGTERM stays.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Settings of this package. Those of the stage, `cleargs.stages.ingest`, inherit them."""
+"""Settings of this package, which those of the stage `cleargs.stages.ingest` inherit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SfmModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL
 
 
 class CaptureConfig(FrozenModel):
-    """Reading of an input, and choice of its frames."""
+    """Settings for reading an input and choosing its frames."""
 
     fps: float | None = Field(
         None,
@@ -47,7 +47,7 @@ class CaptureConfig(FrozenModel):
 
 
 class SfmConfig(FrozenModel):
-    """Search for poses and sparse points."""
+    """Settings for the search for poses and sparse points."""
 
     refine_above: float = Field(
         0.6,

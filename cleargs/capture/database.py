@@ -1,4 +1,4 @@
-"""COLMAP's database of a job: cameras and images by frame number, copies, and what it says of frames."""
+"""COLMAP's database of a job: creation with ids by frame number, copies, and facts about its frames."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from cleargs.capture.colmap import pycolmap
 from cleargs.capture.sfm_job import Job
 
 _MAX_IMAGES = 2**31 - 1
-"""COLMAP numbers a pair of images by the id of the first, times this, plus that of the second."""
+"""COLMAP's number of a pair of images is the id of the first times this, plus the id of the second."""
 
 
 def create_database(database: Path, job: Job) -> None:
-    """Create ``database`` with cameras and images in frame order: ids do not depend on threads.
+    """Create ``database`` with cameras and images in frame order, so that ids do not depend on threads.
 
-    The features of a killed run stay.
+    Features that a killed run left in the database stay.
     """
     cameras = colmap_cameras(job)
     if database.exists():
@@ -48,7 +48,7 @@ def set_cameras(database: Path, cameras: Sequence[pycolmap.Camera]) -> None:
 
 
 def colmap_cameras(job: Job) -> list[pycolmap.Camera]:
-    """Return the cameras of ``job``, with ids from 1, and the focal lengths that their input images state."""
+    """Return the cameras of ``job``, with ids from 1 and the focal lengths in the EXIF of input images."""
     cameras = []
     for number, (known, image) in enumerate(zip(job.cameras, job.exif_images, strict=True)):
         camera = pycolmap.Camera(**asdict(known), camera_id=number + 1)
@@ -59,7 +59,7 @@ def colmap_cameras(job: Job) -> list[pycolmap.Camera]:
 
 
 def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
-    """Start from the focal length that an input image of the camera states, where it does."""
+    """Set the focal length of ``camera`` to the one in the EXIF data of ``image``, if there is one."""
     try:
         stated = pycolmap.infer_camera_from_image(image)
     except ValueError:  # a format that COLMAP does not read (it gets PNG copies): no EXIF either
@@ -102,7 +102,7 @@ def copy_database(database: Path, copy: Path) -> None:
 
 
 def frames_with_few_features(database: Path, names: Collection[str], limit: float) -> dict[str, int]:
-    """Return images of these names with fewer features than ``limit``, and their ids; none once matched."""
+    """Return name -> id of images with fewer than ``limit`` features; nothing once pairs were matched."""
     with pycolmap.Database.open(database) as opened:
         if opened.num_matched_image_pairs():
             return {}
@@ -125,7 +125,7 @@ def remove_features(database: Path, image_ids: Collection[int]) -> None:
 
 
 def why_missing(database: Path, missing: Mapping[int, str]) -> dict[str, str]:
-    """Return the reason why COLMAP found no pose, by image name; ``missing`` are image ids and names."""
+    """Return image name -> reason why COLMAP found no pose. ``missing`` is image id -> image name."""
     with pycolmap.Database.open(database) as opened:
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
         features = {image_id: opened.num_keypoints_for_image(image_id) for image_id in missing}

@@ -19,7 +19,7 @@ T = TypeVar("T")
 def image_folders(root: Path) -> list[Path]:
     """Return ``images/`` and its reductions ``images_N/`` below ``root``, the largest images first.
 
-    LLFF and nerfstudio name images that are N times smaller so.
+    LLFF and nerfstudio use this name for a folder of images that are N times smaller.
     """
     factors = {root / "images": 0}
     for folder in root.glob("images_*"):
@@ -50,7 +50,7 @@ def folder_of_images(root: Path) -> Path | None:
 
 
 def folders_to_search(root: Path) -> list[Path]:
-    """Return the folders with images: ``images/``, its reductions, others but ``masks/``, and ``root``."""
+    """Return the folders with images: ``images/``, its reductions, others except ``masks/``, and ``root``."""
     others = sorted(path for path in root.iterdir() if path.is_dir() and is_inside(path.name))
     folders = dict.fromkeys([*image_folders(root), *others, root])
     folders.pop(root / "masks", None)
@@ -58,10 +58,10 @@ def folders_to_search(root: Path) -> list[Path]:
 
 
 def find_images(root: Path, names: Sequence[str]) -> tuple[Path, dict[str, Path], bool]:
-    """Return the folder of ``root`` with most images of these ``names``, the paths found, and how.
+    """Return the folder in ``root`` with most images of ``names``, name -> path, and True if found by stems.
 
-    Images with exactly these names come first. If no folder has any, those with the same stems are taken,
-    with any suffix and case. The last value is True then.
+    Images with exactly these names are searched first. If no folder has any, images with the same stems are
+    searched, with any suffix and case.
     """
     best: tuple[Path, dict[str, Path], bool] = (root / "images", {}, False)
     for by_stem in (False, True):
@@ -176,7 +176,7 @@ def chosen(
 ) -> tuple[SourceFrame, ...]:
     """Return at most ``at_most`` of ``frames``, evenly, with their masks in the input ``source``.
 
-    Masks are found by ``names``, or those of the frames. A mask that a frame has stays.
+    Masks are found by ``names`` (None: the names of the frames). A frame that has a mask keeps it.
     """
     names = [frame.name for frame in frames] if names is None else names
     masks = masks_of(mask_folder(source), names)

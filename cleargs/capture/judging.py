@@ -1,7 +1,7 @@
-"""Matches that no adjustment sees, and how well poses and cameras explain them.
+"""Matches that are kept out of adjustments, and measures of how well poses and cameras explain matches.
 
-Poses and lenses that were fitted to matches explain these matches better the more free numbers they have.
-Only matches that took no part show the better one of two fits.
+Poses and lenses explain the matches to which they were fitted better the more free parameters they have. Only
+matches that were kept out of the fit show which of two fits is better.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from cleargs.capture.colmap import pycolmap
 HELD_OUT = 10
 """Every tenth track is kept out."""
 FIT_PX = 4.0
-"""Distance from its epipolar line up to which a match fits the poses, px (COLMAP verifies with the same)."""
+"""Distance from its epipolar line up to which a match fits the poses, px (as in COLMAP's verification)."""
 
 _WITH_MATRIX = (
     pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
     pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED,
 )
-"""Pairs whose matches fix a fundamental matrix: the scene is not a plane, and the camera moved."""
+"""Kinds of pairs that determine a fundamental matrix: the scene is not a plane, and the camera moved."""
 
 Pixels = NDArray[np.float64]  # [K, 2]
 Matches = dict[tuple[int, int], tuple[Pixels, Pixels]]
@@ -48,10 +48,10 @@ def verified_matches(database: Path) -> Matches:
 def keep_out(database: Path) -> tuple[Matches, float]:
     """Remove every `HELD_OUT`-th track from the verified matches in ``database``.
 
-    A track is all features that matches connect. Its matches are kept out together: else the others would
-    give its point away. Returns the removed matches, and their median distance, px, from the lines of the
-    fundamental matrices that COLMAP fitted to each pair alone: no poses explain them much better. It is 0
-    where no pair has one.
+    A track is the set of features that matches connect. Its matches are kept out together, since any of them
+    would help to fit its point. Returns the removed matches, and their median distance, px, from the epipolar
+    lines of the fundamental matrices that COLMAP fitted to each pair alone (0 if no pair has a matrix). No
+    poses explain the matches much better than these matrices.
     """
     kept_out: Matches = {}
     alone = [np.zeros(0)]
@@ -67,11 +67,11 @@ def keep_out(database: Path) -> tuple[Matches, float]:
         a, b = np.concatenate([np.zeros((0, 2), np.int64), *edges.values()]).T
         graph = coo_array((np.ones(len(a)), (a, b)), shape=(sum(sizes),) * 2)
         tracks = connected_components(graph)[1]
-        # By its first feature, a track is the same in another database.
+        # Identified by its first feature, a track is the same in another database.
         first = np.unique(tracks, return_index=True)[1]
         owner = np.repeat(list(pixels), sizes)[first]
         number = first - np.array([start[key] for key in owner.tolist()], np.int64)
-        # Wrong matches join tracks: one of more features than there are images is none.
+        # Wrong matches join tracks: a track with more features than there are images is not a real one.
         chosen = ((owner + number) % HELD_OUT == 0) & (np.bincount(tracks) <= len(pixels))
         for (one, two), geometry in geometries.items():
             rows, out = np.asarray(geometry.inlier_matches), chosen[tracks[edges[one, two][:, 0]]]
@@ -92,8 +92,8 @@ def epipolar_errors(
 ) -> NDArray[np.float64]:
     """Return the distances of ``matches`` from their epipolar lines (Sampson error), px.
 
-    They are infinite where a frame has no pose. Source: Hartley and Zisserman, Multiple View Geometry, 2nd
-    edition, equation 11.9.
+    It is infinite if a frame of the pair has no pose. Source: Hartley and Zisserman, Multiple View Geometry,
+    2nd edition, equation 11.9.
     """
     found = [np.zeros(0)]
     for (one, two), (first, second) in matches.items():
@@ -126,10 +126,11 @@ def fitting_shares(model: pycolmap.Reconstruction, matches: Matches) -> dict[int
 
 
 def weakest_join(model: pycolmap.Reconstruction, database: Path) -> tuple[int, float]:
-    """Return the image whose join with the images before it holds least, and the share of matches that hold.
+    """Return the image with the weakest join to the images before it, and the share of matches that hold.
 
-    A verified match between it or a later image and an earlier one holds if both features see the same point.
-    With different scales they see two. Only features that see points count; without any, the share is 1.
+    Matches across a join are the verified ones between the earlier images and this or a later image. A match
+    holds if both its features see the same point; if the two sides have different scales, they see two. Only
+    features that see points count. The share is 1 if there are none.
     """
     points = {
         key: np.array([point.point3D_id for point in image.points2D], np.uint64)

@@ -1,10 +1,10 @@
-"""Pairs of frames to match, and their matching by processes of one thread each.
+"""Pairs of frames to match, and their matching by single-threaded processes.
 
 Pairs are all pairs, or neighbours and distant frames that look alike. No external vocabulary is needed: the
 words are clustered from the capture's own descriptors.
 
 COLMAP's threads do not always find the same matches (docs/experiments/poses.md). Each process matches blocks
-of pairs in its own copy of the database. Its matches are copied back at the end, or by the next run if this
+of pairs in its own copy of the database. The matches are copied back at the end, or by the next run if this
 one is killed.
 """
 
@@ -28,11 +28,11 @@ from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import copy_database, is_sound, remove_database
 
 _PAIRS_PER_BLOCK = 200
-"""Most pairs of a block. COLMAP indexes the features of a frame again in each block (a tenth of the time),
-and keeps no matches of an unfinished block."""
+"""Maximum number of pairs per block. COLMAP indexes the features of a frame again in each block (a tenth of
+the time), and keeps no matches of an unfinished block."""
 
 N_WORDS = 32
-"""Words of the vocabulary: VLAD works with few."""
+"""Number of words in the vocabulary; VLAD needs only a few."""
 
 _SAMPLE = 20_000
 _ROUNDS = 8
@@ -71,7 +71,7 @@ def loop_pairs(
 
 
 def _vocabulary(rows: NDArray[np.uint8], seed: int) -> NDArray[np.float64]:  # [N_WORDS, 128]
-    """k-means on a sample of descriptors, centres rounded to whole numbers."""
+    """Return the centres of k-means on a sample of descriptors, rounded to whole numbers."""
     random = np.random.default_rng(seed)
     sample = rows[random.permutation(len(rows))[:_SAMPLE]].astype(np.float64)
     words = sample[:N_WORDS].copy()
@@ -116,10 +116,10 @@ def match_pairs(
     """Match and verify the ``pairs`` of frame numbers that have no matches in ``database`` yet.
 
     The result is the same for any number of ``processes``. ``done`` receives the number of finished pairs.
-    Raises BrokenProcessPool if a process ended, and sqlite3.DatabaseError if its matches cannot be copied.
+    Raises BrokenProcessPool if a process died, and sqlite3.DatabaseError if its matches cannot be copied.
     """
     for leftover in _shares(database):
-        # One that was damaged when its run was killed is left out: its pairs are matched again.
+        # A copy that was damaged when its run was killed is ignored: its pairs are matched again.
         with suppress(sqlite3.DatabaseError):
             _gather(database, leftover)
         remove_database(leftover)
@@ -161,7 +161,7 @@ def _shares(database: Path) -> list[Path]:
 
 
 def _gather(database: Path, share: Path) -> None:
-    """Copy the matches in ``share`` to ``database``, or raise sqlite3.DatabaseError if one is damaged."""
+    """Copy the matches in ``share`` to ``database``, or raise sqlite3.DatabaseError if it is damaged."""
     if not is_sound(share):
         raise sqlite3.DatabaseError(f"{share} is damaged")
     with closing(sqlite3.connect(database)) as opened:

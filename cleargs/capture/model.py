@@ -1,4 +1,4 @@
-"""COLMAP sparse models on disk. pycolmap reads them, binary or text; we write them binary.
+"""COLMAP sparse models on disk. pycolmap reads them, binary or text; ClearGS writes them in binary form.
 
 https://colmap.github.io/format.html
 """
@@ -21,7 +21,7 @@ from cleargs.files import write_bytes
 from cleargs.safe_io import FAULTS, cause, open_regular, read_bytes
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, MemoryError, RuntimeError)
-"""With those that pybind11 makes of C++ ones."""
+"""`FAULTS`, and the exceptions that pybind11 raises for those of C++."""
 
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 
@@ -37,7 +37,7 @@ class ModelImage:
     point_ids: NDArray[np.int64]  # [K]
 
     def select(self, which: NDArray[np.bool_]) -> ModelImage:  # [K]
-        """With these keypoints alone."""
+        """Return the image with these keypoints only."""
         return replace(self, xy=self.xy[which], point_ids=self.point_ids[which])
 
 
@@ -51,10 +51,10 @@ class SparseModel:
     xyz: NDArray[np.float64]  # [P, 3]
     error: NDArray[np.float64]  # [P] mean reprojection error, px
     dropped: int = 0
-    """Points of the file that are not finite, and were left out."""
+    """Number of points that were left out, because they are not finite or too far."""
 
     def select(self, which: NDArray[np.bool_]) -> SparseModel:  # [P]
-        """With these points alone, in the images too."""
+        """Return the model with these points only, also in the images."""
         ids = self.point_ids[which]
         images = {key: image.select(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
         return replace(self, images=images, point_ids=ids, xyz=self.xyz[which], error=self.error[which])
@@ -70,7 +70,7 @@ def read_model(folder: Path) -> SparseModel:
     kind = "bin" if (folder / "images.bin").exists() else "txt"
     try:
         with TemporaryDirectory(prefix="cleargs-model-") as alone:
-            # pycolmap also reads rigs and frames next to these files, and their sizes are not checked.
+            # Next to these files pycolmap would also read rigs and frames, whose sizes are not checked.
             for name, end in _ENDS.items():
                 file = folder / f"{name}.{kind}"
                 if kind == "bin":
@@ -80,7 +80,7 @@ def read_model(folder: Path) -> SparseModel:
                 (Path(alone) / file.name).symlink_to(file.resolve())
             return _converted(pycolmap.Reconstruction(alone))
     except _FAULTS as error:
-        # COLMAP's failed checks start with the line of its source.
+        # The message of a failed check in COLMAP starts with the line of the source.
         reason = "a file breaks off" if isinstance(error, struct.error) else cause(error).rpartition("] ")[2]
         raise InputError(
             f"cannot read the COLMAP model in {folder}: {reason}",
@@ -124,7 +124,7 @@ def write_model(folder: Path, model: SparseModel, rgb: NDArray[np.uint8]) -> Non
 def transform_model(
     model: SparseModel, *, scale: float, rotation: NDArray[np.float64], translation: NDArray[np.float64]
 ) -> SparseModel:
-    """``model`` under x -> scale rotation [3, 3] x + translation [3]."""
+    """Return ``model`` after the map x -> scale rotation [3, 3] x + translation [3]."""
     return model.moved(Similarity(rotation, -rotation.T @ translation / scale, 1 / scale))
 
 
@@ -145,11 +145,11 @@ _ENDS: dict[str, Callable[[bytes, int], int]] = {
     "images": _image_end,
     "points3D": lambda data, at: at + 51 + 8 * _count(data, at + 43),
 }
-"""File of a model -> the position behind the entry at a position of its binary form."""
+"""File of a model -> function from the position of a binary entry to the position after it."""
 
 
 def _require_whole(file: Path, end: Callable[[bytes, int], int]) -> None:
-    """Raise where the counts in a binary file do not fit its size: pycolmap would read zeros on and on."""
+    """Raise if the counts in a binary file do not fit its size: pycolmap would read zeros without end."""
     data = read_bytes(file)
     at = 8
     for _ in range(_count(data, 0)):

@@ -1,4 +1,4 @@
-"""Parts of the pictures that do not belong to the scene: text burnt in, and pictures of all directions."""
+"""Detection of pictures that do not just show the scene: burnt-in text, and panoramas of all directions."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from numpy.typing import NDArray
 
 from cleargs.media.image import image_size, read_rgb
 
-_SAMPLES = 32  # pictures that are compared, evenly over the capture
+_SAMPLES = 32  # number of pictures, evenly over the capture, that are compared
 
 _FEWEST = 6
-"""Fewest images. In fewer, equal pixels by chance are not rare enough."""
+"""Minimum number of images. In fewer, too many pixels are equal by chance."""
 
 _STILL = 4.0
-"""Standard deviation over the pictures, levels, up to which a pixel is still. JPEG and H.264 leave 1 to 3."""
+"""Maximum standard deviation of a still pixel over the pictures, levels. JPEG and H.264 cause 1 to 3."""
 
 _MOVES = 10.0  # median standard deviation over a picture from which the camera moves
 _EDGE = 40.0  # Sobel response of the mean picture, levels per pixel times 4, from which a pixel has structure
 
 _SHARE = 0.002, 0.5
-"""Least and largest share of still structure. Above, the camera stands; below, it is a chance."""
+"""Limits of the share of still pixels with structure: less is chance, more means a still camera."""
 
 
 def still_parts(images: Sequence[Path]) -> NDArray[np.uint8] | None:
-    """Return a mask of what is at the same pixels in all ``images`` of a moving camera (0 there, else 255).
+    """Return a mask that is 0 at pixels that are equal in all ``images`` of a moving camera, 255 elsewhere.
 
-    Still pixels count where they have structure that differs from their surroundings, as letters, logos and
-    bars have: a clipped sky is still too, but belongs to the scene. None where there are none, and where the
-    images are of several sizes.
+    Only pixels with structure count, as letters, logos and bars have it: a clipped sky is equal in all images
+    too, but belongs to the scene. Returns None without such pixels, for a still camera, for few images, and
+    for images of several sizes.
     """
     step = max(1, len(images) / _SAMPLES)
     chosen = [images[int(index * step)] for index in range(min(len(images), _SAMPLES))]
@@ -71,6 +71,6 @@ def wraps_around(rgb: NDArray[np.uint8]) -> bool:  # [H, W, 3]
     columns = rgb.astype(np.float32)
     across = float(np.abs(columns[:, 0] - columns[:, -1]).mean())
     adjacent = float(np.abs(np.diff(columns, axis=1)).mean())
-    # Half a picture apart, columns are as different as chance has it.
+    # Columns that are half a picture apart differ as unrelated ones do.
     apart = float(np.abs(columns[:, 0] - columns[:, width // 2]).mean())
     return across <= 3 * adjacent and across < 0.5 * apart

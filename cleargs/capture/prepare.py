@@ -28,8 +28,8 @@ from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
 from cleargs.types import ImageU8, MaskU8
 
-_PANORAMAS = 3  # pictures that are looked at for panoramas
-_COARSEST_MASK = 8  # most pixels of a working image that one of its mask may stand for, along a side
+_PANORAMAS = 3  # number of pictures that are tested for a panorama
+_COARSEST_MASK = 8  # maximum number of image pixels per mask pixel, along a side
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class WorkFrame:
     masked: bool
     camera: Intrinsics | None
     transparent: bool = False
-    """True where its mask is the transparency of its image."""
+    """True if the mask of the frame is the transparency of its image."""
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
@@ -81,7 +81,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
         )
     prepared = [_work_frame(frame, path, masks / f"{path.name}.png", still) for frame, path in pairs]
     if any(made.masked for made in prepared):
-        for made in prepared:  # COLMAP leaves out an image that has none where others have
+        for made in prepared:  # COLMAP leaves out an image without a mask if others have one
             mask = masks / f"{made.image}.png"
             if not mask.is_file():
                 write_mask(mask, np.full((made.height, made.width), 255, np.uint8))
@@ -162,7 +162,7 @@ def _stencilled(
     mask = np.full((height, width), 255, np.uint8) if still is None else still
     if stencil is None:
         return mask
-    # To whole pixels, a mask of one pixel has any proportions.
+    # Rounded to whole pixels, a mask of one pixel has any proportions.
     coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
     if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
         what = "is far smaller than it" if coarse else "does not have its proportions"
@@ -172,7 +172,7 @@ def _stencilled(
 
 
 def read_stencil(frame: SourceFrame) -> MaskU8 | None:
-    """Return the mask of the frame, else the transparency of its image; None if all of it counts."""
+    """Return the mask of the frame, else the transparency of its image; None if all pixels count."""
     if frame.mask is not None:
         return read_mask(frame.mask)
     return None if frame.pts is not None else read_alpha(frame.path, upright=not _is_as_stored(frame))

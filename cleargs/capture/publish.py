@@ -35,10 +35,10 @@ def publish(
 ) -> SparseModel:
     """Write images, masks, the three tables and the COLMAP model of the undistorted capture into ``out``.
 
-    Points take their colour from train frames. Points that no train frame shows, or fewer than two frames
-    after undistortion cropped them, are left out.
-    The published model is returned. ``model`` is that of the working images in ``work``, ``placed`` says how
-    the pose of each was found or why there is none, and ``test`` are the numbers of the test frames.
+    The colours of points are from train frames. Points are left out if no train frame shows them, or if fewer
+    than two frames show them after undistortion cropped the images. Returns the published model. ``model`` is
+    that of the working images in ``work``, ``placed`` says how the pose of each was found or why there is
+    none, and ``test`` are the numbers of the test frames.
     """
     make_folder(out / "images", empty=True)
     remove(out / "masks")  # without the folder, no frame has a mask
@@ -97,7 +97,7 @@ def publish(
 
 
 def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Intrinsics]:
-    """Return the camera of each frame; for an unregistered one its own, else the commonest of its size."""
+    """Return the camera of each frame; an unregistered one has its own, or the most frequent of its size."""
     by_name = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     found = [by_name.get(frame.image, frame.camera) for frame in frames]
     common = Counter(camera for camera in found if camera is not None).most_common()

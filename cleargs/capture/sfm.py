@@ -31,7 +31,7 @@ from cleargs.progress import Reporter
 from cleargs.safe_io import faults_as, read_json
 
 FARTHEST = 1e9
-"""Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""
+"""Largest coordinate of a point in the normalised world, where the farthest camera has distance 1."""
 
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
@@ -97,7 +97,7 @@ def reconstruct(
                 f"{adopted.dropped} points of the input's sparse model are left out: not finite, or too far"
             )
         missed = float(np.median(adopted.error)) if len(adopted.error) else 0.0
-        if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
+        if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an unknown error
             return Reconstruction(adopted, world, SfmOutcome(placed=_placed(frames, {}), missed_px=missed))
     readings = {name: [world.pose(pose) for pose in read] for name, (world, read) in worlds.items()}
     model, outcome = _run(job_of(posed, readings, folder, config, seed, threads), reporter)
@@ -128,7 +128,7 @@ def _normalised(model: SparseModel, world: Similarity | None, outcome: SfmOutcom
 
 
 def _placed(frames: Sequence[WorkFrame], found: Mapping[str, str]) -> dict[str, str]:
-    """Return how each frame was placed, by ``found``; frames that it does not have keep the input's pose."""
+    """Return image -> how it was placed. Frames that are not in ``found`` keep the pose of the input."""
     return {
         frame.image: "no pose in the input" if frame.source.pose is None else found.get(frame.image, "given")
         for frame in frames
@@ -136,9 +136,9 @@ def _placed(frames: Sequence[WorkFrame], found: Mapping[str, str]) -> dict[str, 
 
 
 def _conventions(poses: Sequence[Pose], *, others: bool) -> dict[str, tuple[Similarity, Sequence[Pose]]]:
-    """Return the poses by the input's convention, and with ``others`` by all that its author may have meant.
+    """Return the poses in the input's convention and, with ``others``, in all that its author may have meant.
 
-    The value is the similarity that normalises their world, and the poses in that world.
+    The value is the similarity that normalises the world of these poses, and the poses (not normalised).
     """
     found: dict[str, tuple[Similarity, Sequence[Pose]]] = {OWN: (normalise(poses), poses)}
     if others:
@@ -148,13 +148,13 @@ def _conventions(poses: Sequence[Pose], *, others: bool) -> dict[str, tuple[Simi
             inverse: [pose.inverted(flip=True) for pose in poses],
             f"{inverse}, with OpenCV axes": [pose.inverted(flip=False) for pose in poses],
         }.items():
-            with suppress(InputError):  # all at one place by this one
+            with suppress(InputError):  # in this convention all cameras are at one place
                 found[name] = normalise(meant), meant
     return found
 
 
 def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, reporter: Reporter) -> None:
-    """Say whether the input's poses were adjusted or found again, and by how much that explains more."""
+    """Report if the input's poses were adjusted, found again or kept, with the errors before and after."""
     missed = outcome.missed_px or 0.0
     if outcome.method != "given":
         before, after = outcome.errors_px["given"], outcome.errors_px[outcome.method]
@@ -181,7 +181,7 @@ def _check_registered(registered: int, total: int, config: SfmConfig, reporter: 
 
 
 def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
-    """Let COLMAP do its work, unless a killed run got as far as the model."""
+    """Run COLMAP in a child process, unless a killed run has already made the model."""
     if (found := _resumed(job.folder, reporter)) is not None:
         return found
     file = job.folder / "job.json"
@@ -200,9 +200,9 @@ def job_of(
 ) -> Job:
     """Return the job of COLMAP's process for the working images in ``folder``.
 
-    ``poses`` are those of all frames by convention; None: they must be found. Then frames of one size and one
-    lens share a camera, or each frame has its own, and an input image of each camera may state its focal
-    length.
+    ``poses`` is convention -> poses of all frames. If it is None, poses must be found. Then frames of one
+    size and lens share a camera, or each frame has its own (`SfmConfig.shared_camera`), and an input image of
+    each camera may state its focal length.
     """
     folder = folder.resolve()
     if poses is not None:
@@ -270,7 +270,7 @@ def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
 
 def _within_reach(model: SparseModel) -> SparseModel:
     """Return the model without the points beyond `FARTHEST`, which single precision may not hold."""
-    near = np.asarray((np.abs(model.xyz) < FARTHEST).all(axis=1))  # infinite ones, and NaN, are not
+    near = np.asarray((np.abs(model.xyz) < FARTHEST).all(axis=1))  # False for infinity and NaN
     return replace(model.select(near), dropped=model.dropped + int((~near).sum()))
 
 

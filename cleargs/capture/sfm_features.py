@@ -18,31 +18,31 @@ from cleargs.capture.sfm_job import Job
 
 @dataclass(frozen=True)
 class FeatureSettings:
-    """Settings of features, and of the frames that they place."""
+    """Settings of features, and of the placement of frames by these features."""
 
     name: str
-    """Value of ``placed`` of these frames."""
+    """Value of ``placed`` for frames that these features placed."""
     reduced: int = 1
-    """The images are reduced to one over this, if any is as large as the largest."""
+    """Maximum long side of an image: the long side of the largest image, divided by this."""
     contrast: float = 0.02 / 3
     inliers: int = 30
     """Fewest points of the model that must fit the pose of a frame."""
     neighbours: bool = False
-    """Placed frames within ``overlap`` of a frame that is left out get new features too: without them a
-    dark or turning stretch breaks the chain."""
+    """Placed frames within ``overlap`` of a frame that is left out get new features too. Otherwise the chain
+    of matches breaks where frames are dark or the camera turns."""
 
 
 FIRST = FeatureSettings("sfm")  # COLMAP's defaults
 _FEW_FEATURES, _FAINT = 0.25, 0.002
-"""Frames with fewer than this share of ``max_features`` get features down to this contrast at once: dark and
-plain ones, in which COLMAP finds few or none (docs/experiments/poses.md)."""
+"""Frames with fewer features than this share of ``max_features`` get features down to this contrast at once:
+dark and plain frames, in which COLMAP finds few or none (docs/experiments/poses.md)."""
 AGAIN = (
     FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),
     FeatureSettings("sfm with fainter features", neighbours=True, contrast=0.001, inliers=15),
 )
-"""For frames that are left out. A blur of 24 px at 480 is half as long at half the size, and the contrast
-that it leaves is enough (docs/experiments/poses.md). Affine-shape features and guided matching of these
-frames place no more of them."""
+"""Settings for frames that were left out, tried in this order. A blur of 24 px at 480 px is half as long at
+half the size, and the contrast that it leaves is enough (docs/experiments/poses.md). Affine-shape features
+and guided matching place no more of these frames."""
 
 
 class Features:
@@ -54,9 +54,10 @@ class Features:
         self._database = job.folder / "database.db"
 
     def _extract(self, database: Path, names: Sequence[str], settings: FeatureSettings) -> None:
-        """SIFT on the working images; frames that have features already are skipped by COLMAP.
+        """Find SIFT features in the working images. COLMAP skips frames that already have features.
 
-        Those for which ``settings`` find few features get fainter ones too, unless a killed run matched them.
+        Frames in which ``settings`` find few features get fainter ones too, unless a killed run has already
+        matched pairs.
         """
         job = self._job
         limit = _FEW_FEATURES * job.config.max_features if settings.contrast > _FAINT else 0
@@ -92,7 +93,7 @@ class Features:
         match_pairs(database, job.names, pairs, job.seed, job.threads, lambda n: self._report(done=n))
 
     def _pairs(self) -> list[tuple[int, int]]:
-        """All pairs of frames, or neighbours and distant frames that look alike."""
+        """Return all pairs of frames, or neighbours and distant frames that look alike."""
         frames, config = len(self._job.names), self._job.config
         if frames < config.exhaustive_below:
             return list(combinations(range(frames), 2))

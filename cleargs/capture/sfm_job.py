@@ -16,7 +16,7 @@ OWN = "own"
 """Convention of an input's poses: the one of its layout."""
 
 OUTCOME = "outcome.json"
-"""In the folder of the model: its `SfmOutcome`."""
+"""File in the folder of a model, with its `SfmOutcome`."""
 
 
 class Job(FrozenModel):
@@ -39,7 +39,7 @@ class Job(FrozenModel):
 
 
 class SfmOutcome(FrozenModel):
-    """Origin of a model."""
+    """Origin and errors of a model."""
 
     placed: Mapping[str, str] = Field(default_factory=dict)
     """Working image -> method by which its pose was found, or reason why there is none."""
@@ -50,8 +50,8 @@ class SfmOutcome(FrozenModel):
     method: Literal["given", "adjusted", "sfm"] = "given"
     """Origin of the poses: the input's, the input's after adjustment, or structure from motion."""
     errors_px: Mapping[str, float] = Field(default_factory=dict)
-    """Method -> median distance from their epipolar lines of matches that were kept out, px."""
+    """Method -> median distance of the kept-out matches from their epipolar lines, px."""
     lens: str = ""
-    """COLMAP model of the cameras that were adjusted; empty: no camera was."""
+    """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
     torn_at: int | None = None
-    """Number of the first frame after a join that contradicts its matches."""
+    """Number of the first frame after a join that matches contradict (`weakest_join`); None: no such join."""

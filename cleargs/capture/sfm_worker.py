@@ -2,7 +2,7 @@
 
 It reads its job from JSON, works in ``job["folder"]`` and writes a binary model to ``folder/model``. Features
 and matches (`cleargs.capture.sfm_features`) of a killed run are used again. Frames that mapping leaves out
-are tried a second time at half resolution.
+are tried again with other features.
 
 The result is the same for any number of threads: ids are given in frame order before any thread starts, every
 random choice is seeded, frames are matched by processes, and mapping and triangulation (whose least squares
@@ -39,30 +39,30 @@ from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
 
 _MIN_MODEL = 10
-"""COLMAP's fewest frames of a model: it discards a smaller one and starts elsewhere. In a
-short capture it is a third of the frames, because eight of twelve are a model."""
+"""Minimum number of frames of a model: COLMAP discards a smaller model and starts elsewhere. In a short
+capture the minimum is a third of the frames, since a model of 8 of 12 frames is useful."""
 _CONVINCING, _UNEXPLAINED, _EXPLAINED = 0.3, 0.05, 1.3
-"""Other poses and cameras are taken if matches that were kept out are then off by at most the first share of
-the error before (medians), or the second if they are still off by more than `_EXPLAINED` times the error that
-separate geometries of the pairs leave: poses that bend to explain blur or a rolling shutter are farther from
-the truth than given ones, unless these are far off. All three, and the next, by docs/experiments/poses.md."""
+"""Other poses and cameras replace given ones if the median error of the kept-out matches falls to a share of
+the error before: `_CONVINCING`, or `_UNEXPLAINED` if the new error is above `_EXPLAINED` times the error with
+a separate geometry per pair. Poses that bend to explain blur or a rolling shutter are farther from the truth
+than given ones, unless these are far off. All three, and the next, are from docs/experiments/poses.md."""
 _NEARER = 0.9
-"""SfM is preferred to adjusted poses only if it lowers the mean error to at most this share: where both are
-right, they are alike, and adjusted poses are in the user's world exactly."""
+"""SfM is preferred to adjusted poses only if it lowers the mean error to at most this share. If both are
+right, they are alike, and only adjusted poses are exactly in the user's world."""
 _JOINED, _JOINS = 0.92, 3
-"""Least share of the matches across a join whose features see one point, and most joins that are repeated
-(docs/experiments/poses.md)."""
+"""Minimum share of the matches across a join (`weakest_join`) that hold, and maximum number of joins that are
+repeated (docs/experiments/poses.md)."""
 _MISPLACED, _PLACINGS, _LEFT_OUT = 0.6, 2, 0.1
-"""Share of its matches that must fit a frame's pose, and how often frames with less are placed again. Then at
-most this share of all frames is left out: more say that the matches are wrong, not the poses
+"""Minimum share of a frame's matches that fit its pose; how many times frames with less are placed again;
+maximum share of all frames that are then left out. If there are more, the matches are wrong, not the poses
 (docs/experiments/poses.md)."""
 _FITS_PX, _FITS = 2.0, 0.5
-"""Poses fit the images where at least this share of the matches is within this many pixels of its epipolar
+"""Poses fit the images if at least this share of the matches is within this distance, px, of its epipolar
 line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes, 0.13 with inverted ones."""
 
 
 def main() -> int:
-    """Do the job; the exit code is 3 if it failed for a reason that was reported."""
+    """Run the job. Return the exit code: 3 if the job failed for a reason that was reported."""
     report = reports_to_parent()
     job = Job.model_validate(read_json(Path(sys.argv[1])))
     try:
@@ -90,7 +90,7 @@ class _Sfm(Features):
         self._options.triangulation.random_seed = job.seed
 
     def run(self) -> None:
-        """Make the model and its `SfmOutcome`. Raises StageError when the frames give none."""
+        """Make the model and its `SfmOutcome`. Raises StageError if the frames give none."""
         job = self._job
         pycolmap.set_random_seed(job.seed)
         create_database(self._database, job)
@@ -128,7 +128,7 @@ class _Sfm(Features):
     def _from_poses(
         self, given: Mapping[str, list[list[list[float]]]], pairs: Sequence[tuple[int, int]]
     ) -> tuple[pycolmap.Reconstruction, SfmOutcome]:
-        """Return the model at the input's poses, or at others where the images contradict these."""
+        """Return the model at the input's poses, or at other poses if the images contradict these."""
         convention = self._convention(given)
         start = self._triangulate(given[convention])
         missed = median_residual(start)
@@ -158,7 +158,7 @@ class _Sfm(Features):
         return model, outcome.model_copy(update={"errors_px": errors, **update})
 
     def _convention(self, given: Mapping[str, list[list[list[float]]]]) -> str:
-        """Return the convention by which poses fit the matches best; `OWN` where it fits, or none does."""
+        """Return the convention whose poses fit the matches best; `OWN` if it fits, or if no other does."""
         if len(given) == 1:
             return OWN
         matches = verified_matches(self._database)
@@ -177,8 +177,8 @@ class _Sfm(Features):
     ) -> tuple[pycolmap.Reconstruction | None, dict[str, str]]:
         """Return the model of structure from motion in the world of ``given``, and how frames were placed.
 
-        The matches that ``judge`` kept out take no part in its last adjustment. None where a frame has no
-        pose.
+        The last adjustment does not use the matches that ``judge`` kept out. The model is None if a frame has
+        no pose.
         """
         job = self._job
         guesses = [guessed_camera(FIRST_LENS, camera.width, camera.height) for camera in job.cameras]
@@ -190,7 +190,7 @@ class _Sfm(Features):
             return None, {}
         if model.num_reg_images() < len(job.names):
             return None, {}
-        # Frames that were placed again have other features. The tracks of the others are kept out alike.
+        # Frames that were placed again have other features. The same tracks of all others are kept out.
         same = self._matched == self._database
         adjuster = judge if same else Adjuster(self._matched, self._with_points)
         model = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
@@ -208,7 +208,7 @@ class _Sfm(Features):
     def _corrected(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
         """Return ``model`` after frames that contradict their matches were placed again, or left out.
 
-        A frame may be placed by wrong matches before the frames are there that share right ones with it.
+        A frame may be placed by wrong matches before the frames with right matches to it have a pose.
         """
         matches = verified_matches(database)
         shares = fitting_shares(model, matches)
@@ -252,12 +252,12 @@ class _Sfm(Features):
         return model
 
     def _map(self) -> pycolmap.Reconstruction:
-        """Incremental mapping; the model with the most registered frames (the first of equals)."""
+        """Run incremental mapping. Return the model with the most registered frames (the first of equals)."""
         total = len(self._job.names)
         options = copy.deepcopy(self._options)
         options.min_model_size = min(_MIN_MODEL, max(3, total // 3))
         options.max_num_models = 5
-        # COLMAP's 1.1 adjusts the whole model after every tenth frame more: half as much again, equal errors.
+        # COLMAP's 1.1 adjusts the whole model per tenth of growth: half as much time again, equal errors.
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         self._report(phase="reconstructing", total=total)
         registered = count(3)  # after the first pair
@@ -321,7 +321,7 @@ class _Sfm(Features):
     def _continued(
         self, model: pycolmap.Reconstruction, database: Path, again: set[int], settings: FeatureSettings
     ) -> pycolmap.Reconstruction:
-        """Return the result of mapping from ``model`` on, where the frames ``again`` have new features."""
+        """Return ``model`` after mapping from ``database`` placed the frames ``again`` once more."""
         options = copy.deepcopy(self._options)
         options.multiple_models = False
         options.mapper.abs_pose_min_num_inliers = settings.inliers
@@ -338,7 +338,7 @@ class _Sfm(Features):
         return max([*models.values(), model], key=lambda model: model.num_reg_images())
 
     def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
-        """Return points at the given poses and cameras, which stay as they are here."""
+        """Return a model with points triangulated at the given poses and cameras, which do not change."""
         self._report(phase="triangulating", total=None)
         model = pycolmap.Reconstruction()
         with pycolmap.Database.open(self._database) as opened:
@@ -353,7 +353,7 @@ class _Sfm(Features):
 
     def _with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
         """Return ``model`` with points triangulated again from the matches in ``database``."""
-        set_cameras(database, list(model.cameras.values()))  # COLMAP refuses a model of another lens
+        set_cameras(database, list(model.cameras.values()))  # COLMAP refuses a model whose lenses differ
         return pycolmap.triangulate_points(
             model, database, self._job.images, self._output, options=self._options
         )

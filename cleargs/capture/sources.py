@@ -12,7 +12,7 @@ from cleargs.errors import InputError
 from cleargs.plugins import load_plugin
 
 MIN_FRAMES = 3
-"""Two frames have no third to confirm what they see."""
+"""Minimum number of frames. With two, no third frame confirms the points that they see."""
 
 LAYOUTS: tuple[Layout, ...] = (transforms, colmap, llff, video, images)
 

@@ -51,7 +51,7 @@ class Frame:
     split: Annotated[Literal["train", "test"], "train, or test (held out: has a pose, enters nothing else)"]
     placed: Annotated[str | None, "method by which the pose was found, or the reason why there is none"]
     mask: str | None
-    """No column: path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None."""
+    """Path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None. Not in the table."""
 
 
 FRAMES = schema_of(Frame)
@@ -86,7 +86,7 @@ class Points:
 
 
 def load_frames(ingest_dir: Path) -> list[Frame]:
-    """Every frame of a finished ingest folder, unregistered ones too, by frame_id. Raises StoreError."""
+    """Return all frames of a finished ingest folder by frame_id, unregistered ones too. Raises StoreError."""
     table = read_table(ingest_dir / "frames.parquet", FRAMES)
     frames = []
     for row in table.to_pylist():

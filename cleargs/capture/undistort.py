@@ -44,7 +44,7 @@ class Undistorter:
         return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST))
 
     def points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2]
-        """Return positions in the published image of pixel positions in the lens's image."""
+        """Map pixel positions in the image of the lens to positions in the published image."""
         rays = self._lens.colmap().cam_from_img(np.ascontiguousarray(xy))
         return np.asarray(np.asarray(rays) * self.pinhole.focal + np.array(self.pinhole.centre))
 
@@ -83,7 +83,7 @@ def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
 
 
 def _covered(lens: Intrinsics) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom (tangents) of the rectangle that the lens's image covers wholly."""
+    """Return left, top, right and bottom (tangents) of the rectangle that the lens's image covers wholly."""
     t = np.linspace(0, 1, _EDGE_SAMPLES)
     zero, one = np.zeros_like(t), np.ones_like(t)
     size = np.array([lens.width, lens.height])

@@ -57,5 +57,5 @@ _PRINTED = re.compile(rf"(?<![\w./-])cleargs (?=(?:{'|'.join(COMMANDS)})\b)")
 
 
 def as_called(text: str) -> str:
-    """Return ``text`` with the commands in it as the user's shell understands them."""
+    """Return ``text`` with ``cleargs`` in its commands replaced by what the user must type here."""
     return _PRINTED.sub(lambda match: f"{program(Path.cwd())} ", text)

@@ -1,4 +1,4 @@
-"""Options and output functions of several commands."""
+"""Options and output functions that several commands share."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SHORTCUTS = {
     "start": "ingest.start",
     "end": "ingest.end",
 }
-"""Option -> the setting that it stands for."""
+"""Option -> the setting that it changes."""
 
 store_option = click.option(
     "--store",
@@ -97,9 +97,9 @@ verbose_option = click.option(
 
 @contextmanager
 def kept_log(context: click.Context, path: Path, *, writes: bool) -> Iterator[Say]:
-    """Write the messages of a command to ``path`` too, if it ``writes``, and the error that ends it.
+    """If ``writes`` is true, also write the messages of a command, and its final error, to ``path``.
 
-    Yields a function for details, which are shown only with ``-v``.
+    Yields a function for details, which the terminal shows only with ``-v``.
     """
     chosen: Say | None = context.meta.get(LOG)
     file = LineFile(path, needed=RUN_FILE)  # nothing is written into a folder that is not a run
@@ -128,7 +128,7 @@ def kept_log(context: click.Context, path: Path, *, writes: bool) -> Iterator[Sa
 
 
 def completed(names: Callable[[], Iterable[str]]) -> Callable[..., list[str]]:
-    """Return the function by which click completes a value: those of ``names`` that begin with it."""
+    """Return a function with which click completes a value to the ``names`` that begin with it."""
     return lambda context, parameter, begin: [name for name in names() if name.startswith(begin)]
 
 
@@ -189,7 +189,7 @@ def report_option(help: str) -> Callable[[F], F]:
 
 
 def open_option(help: str) -> Callable[[F], F]:
-    """Return the option ``--open`` of a command that writes or serves a page; the command gets ``opens``."""
+    """Return the option ``--open`` of a command that writes or serves a page, as the parameter ``opens``."""
     return click.option("--open", "opens", is_flag=True, help=help)
 
 
@@ -208,9 +208,9 @@ def parse_size(
 quality_option = click.option(
     "--quality",
     type=click.Choice(get_args(Quality)),
-    help="The cost of a run: draft is a look at no more than 60 frames of 640 px, without repairs; standard "
-    "is for publishing; high takes four times its steps and twice its Gaussians. Steps and budgets that a "
-    "recipe names stay.  [default: that of the run; standard for a new run]",
+    help="The cost of a run: draft is a preview of at most 60 frames of 640 px, without repairs; standard "
+    "is for publishing; high takes four times its steps and twice its Gaussians. Steps and budgets in the "
+    "recipe are kept.  [default: that of the run; standard for a new run]",
 )
 
 
@@ -264,7 +264,7 @@ def _limits(context: click.Context, parameter: click.Parameter, value: tuple[str
 
 
 def fail_below_option(figures: str) -> Callable[[F], F]:
-    """Return the option ``--fail-below``, whose value is figure -> limit; ``figures`` lists them."""
+    """Return the option ``--fail-below``. Its value maps figure -> limit; the help lists ``figures``."""
     return click.option(
         "--fail-below",
         multiple=True,
@@ -275,9 +275,9 @@ def fail_below_option(figures: str) -> Callable[[F], F]:
 
 
 def report_below(results: Mapping[str, Mapping[str, Any]], limits: Mapping[str, float]) -> bool:
-    """Print a line on stderr for each figure of ``results`` that is below its limit. Return True if one is.
+    """Print a line on stderr for each figure of ``results`` that is missing or below its limit.
 
-    Raises InputError if no result has a figure of this name.
+    Return True if there is one. Raises InputError if no result has a figure of this name.
     """
     failed = False
     for figure, limit in limits.items():

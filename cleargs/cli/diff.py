@@ -16,7 +16,7 @@ from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.report.report_json import linked_manifests
 
 FIGURES = ("frames", "registered", "gaussians", "psnr_unseen", "repairs")
-"""Figures of a stage's manifest."""
+"""Figures in the manifest of a stage that are compared."""
 
 
 @click.command(
@@ -63,13 +63,13 @@ def _paired(one: dict[str, Any], other: dict[str, Any]) -> Iterator[tuple[str, l
 
 
 def _settings(run: RunSpec) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of everything that may differ between two runs."""
+    """Yield name and value of the input, the device, the seed and all settings of a run."""
     yield from (("input", str(run.source)), ("device", run.device), ("seed", run.config.seed))
     yield from ((setting.name, value) for setting, value in run.config.settings())
 
 
 def _figures(run: RunSpec, dag: Dag) -> Iterator[tuple[str, Any]]:
-    """Yield label and value of the figures of a run: of each stage, and of each evaluation."""
+    """Yield label and value of the figures of a run, from its stages and its evaluations."""
     from cleargs.evaluate.eval_report import read_report
 
     made = linked_manifests(run.folder, dag.names)

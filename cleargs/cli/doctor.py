@@ -73,7 +73,7 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
 
 
 def _device(wants_test: bool) -> tuple[Finding, list[str]]:
-    """Return the device that ``--device auto`` takes, and the lines of a self-test that runs now."""
+    """Return the device that ``--device auto`` chooses, and the lines of the self-test if ``wants_test``."""
     if (obstacle := gpu.cuda_obstacle()) is not None:
         return Finding("device", "bad" if wants_test else "ok", f"cpu ({obstacle})"), []
     facts, report = gpu.current_facts(), []
@@ -90,7 +90,7 @@ def _device(wants_test: bool) -> tuple[Finding, list[str]]:
 
 
 def _library(name: str) -> Finding:
-    found = installed_runtimes() if name == "onnxruntime" else installed_version(name)  # it has several names
+    found = installed_runtimes() if name == "onnxruntime" else installed_version(name)  # several packages
     if found == "absent":
         return Finding(name, "bad", "not installed: install cleargs again")
     return Finding(name, "ok", found)

@@ -39,7 +39,7 @@ _LABELS = {
     "clip-iqa": "CLIP-\nIQA",
 }
 EXPOSURES_DIFFER = 0.5
-"""Gain of PSNR by aligned colours, dB, from which it is shown."""
+"""Gain of PSNR by aligned colours, dB, above which the gain is printed."""
 
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
@@ -211,7 +211,7 @@ def _older(run: Path, path: Path) -> Report:
 
 
 def _seen_before(report: Report) -> str:
-    """Return a line with the number of views that show frames of a training; "" for none."""
+    """Return a note if the scene was trained on frames of these views, or if this is unknown; else ""."""
     scenes = [found for found in report.evaluations if found.scene is not None]
     if any(found.trained_on is None for found in scenes):
         return "note: the frames of the scene's training are not known"
@@ -223,7 +223,7 @@ def _seen_before(report: Report) -> str:
 
 
 def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequence[str]) -> dict[str, Path]:
-    """Name -> scene file of all that is to be rendered; empty where finished images are evaluated."""
+    """Return name -> file of each scene to render; empty if finished images are evaluated."""
     if renders is not None:
         if stages or (target is not None and not target.is_dir()):
             raise InputError("--renders takes the place of a scene", hint="leave out --stage and SCENE.ply")
@@ -262,7 +262,7 @@ def _print(report: Report, output: Path | None) -> None:
     for evaluation in report.evaluations:
         figures = (_figure(metric, evaluation.means[metric]) for metric in metrics)
         table.add_row(_subject(evaluation), f"mean of {len(evaluation.images)}", *figures)
-    console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
+    console = Console(highlight=False, markup=False, soft_wrap=True)  # names may contain brackets
     if line := _seen_before(report):
         console.print(line)
     console.print(table)
@@ -280,7 +280,7 @@ def _subject(evaluation: Evaluation) -> str:
 
 
 def _provenance(evaluation: Evaluation) -> str:
-    """One line on what was compared, so that a table can be judged."""
+    """Return a line with the conditions of the comparison."""
     words = [f"reference {evaluation.reference}, split {evaluation.split[:12]}"]
     if evaluation.poses == "given":
         words.append("at the run's own poses")

@@ -15,8 +15,8 @@ def frame_rows(
 ) -> list[dict[str, Any]]:
     """Return role, scores, worst cue, reason and repair of each row of ``rva/frames.parquet``.
 
-    ``settings`` are those of RVA that made the rows. ``repairs`` are the rows of ``rivr/selection.parquet``;
-    None before RIVR, when frames have no "repair".
+    ``settings`` are those with which RVA made the rows. ``repairs`` are the rows of
+    ``rivr/selection.parquet``. Before RIVR they are None, and the result has no "repair".
     """
     from cleargs.report.frames import worst_cue
 

@@ -21,7 +21,7 @@ KEPT = ("manifest.json", "*.parquet", "colmap/**/*")
 """Files of every stage that go into the pack."""
 
 MADE_OF_NAMES = re.compile(r'^(input = ").*/(.*")$|^store = .*\n', re.MULTILINE)
-"""Lines of ``run.toml`` with paths of this machine: the input, of which the name stays, and the store."""
+"""Lines of ``run.toml`` with paths of this machine: the input, whose file name is kept, and the store."""
 
 
 @click.command(
@@ -38,7 +38,7 @@ Examples:
 @json_option
 @click.pass_obj
 def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -> None:
-    """Pack what is needed to look at RUN and to export it into a ZIP file.
+    """Pack the files of RUN that its report and an export need into a ZIP file.
 
     These are the report, the last scene, the poses and the tables. The images, the earlier scenes and the
     candidates of repairs are left out, so a packed run cannot be continued.

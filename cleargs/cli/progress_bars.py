@@ -25,7 +25,7 @@ PROGRESS, LOG, VERBOSE = "cleargs.progress", "cleargs.log", "cleargs.verbose"
 """Entries of click's ``Context.meta``: ``--progress``, a function that writes to the log, and ``-v``."""
 
 JSON_EVERY = 1.0
-"""Seconds between two progress events of one task."""
+"""Minimum time between two progress events of one task, seconds."""
 
 
 def make_reporter(quiet: bool = False) -> Reporter:
@@ -52,7 +52,7 @@ def make_reporter(quiet: bool = False) -> Reporter:
 
 
 class LineFile:
-    """A text file that grows by lines with the time. Lines wait until its folder has the file ``needed``."""
+    """A log with time stamps. Its lines are kept in memory until its folder contains the file ``needed``."""
 
     def __init__(self, path: Path, needed: str = ".") -> None:
         self.path, self._needed, self._waiting = path, path.parent / needed, [""]
@@ -66,7 +66,7 @@ class LineFile:
 
 
 class LoggingReporter:
-    """Forward to a reporter, and write the lines to a function too."""
+    """A reporter that forwards to another one, and also passes each line to the function ``log``."""
 
     def __init__(self, shown: Reporter, log: Say) -> None:
         self._shown, self._lines = shown, LineReporter(log, lambda text: log(f"warning: {text}"), log)

@@ -85,9 +85,9 @@ def report(
 
 
 def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
-    """Write the report at the end of a run, unless there already is one of the same results.
+    """Write the report at the end of a run, unless a report of the same results exists.
 
-    Return the page, or None if no frames exist or writing failed (with a warning).
+    Return the page. Return None if ingest has no results, or if writing failed, which prints a warning.
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)

@@ -148,7 +148,7 @@ def run(
     if folder is None and (source / RUN_FILE).is_file():  # the user gives the run in place of its capture
         folder, source = source, read_run_file(source, dag).source
     folder = folder or default_folder(source)
-    if (folder / RUN_FILE).is_file():  # the user's defaults are those of new runs
+    if (folder / RUN_FILE).is_file():  # the user's configuration file is for new runs
         of_user = ParameterSource.DEFAULT_MAP
         kept = [x for x in ("store", "device", "quality") if context.get_parameter_source(x) is of_user]
         store = None if "store" in kept else store
@@ -220,8 +220,7 @@ def without_effect(config: Config, given: Sequence[str]) -> Iterator[str]:
     ]
     if "g0.quality" in names and fixed:
         yield (
-            f"{', '.join(fixed)} stay as they are, whatever the quality; "
-            "--recipe default --reset gives them up"
+            f"the quality does not change {', '.join(fixed)}; --recipe default --reset removes these settings"
         )
 
 
@@ -289,7 +288,7 @@ def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:
 def outcome_lines(outcomes: Sequence[StageOutcome], run: Path, report: Path | None = None) -> list[str]:
     """Return at most five lines: the result, its quality, the time, the next command, and the ``report``.
 
-    The last one is an address, which most terminals open on a click.
+    The line of the report is a URL, which most terminals open on a click.
     """
     last = outcomes[-1].manifest
     summaries = {outcome.stage: outcome.manifest.summary for outcome in outcomes}

@@ -43,7 +43,7 @@ LABELS: Mapping[str, str] = {
     "test": "frames held out for testing",
     "given_poses_missed_px": "median reprojection error at the given poses, px",
     "pose_convention": "convention of the given poses",
-    "kept_out_matches_off_px": "median error of matches that took no part, by origin of the poses, px",
+    "kept_out_matches_off_px": "median error of matches that the fit did not use, by origin of the poses, px",
     "focal_px": "focal length, px",
     "stand_in": "stand-ins for reliable frames",
     "effective_frames": "effective number of frames",
@@ -142,7 +142,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
 
 
 def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bool, as_json: bool) -> None:
-    """Print the figures of a stage; of RVA all frames, or the columns of the tables."""
+    """Print the figures of a stage, then the columns of its tables if ``columns``, else (RVA) its frames."""
     manifest = done[stage]
     names = [name for name in sorted(manifest.files) if name.endswith(".parquet") and "/" not in name]
     tables = {name: read_any_table(run / stage / name) for name in names}
@@ -258,7 +258,7 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
 def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow) -> list[str]:
     """Write the layers of a frame side by side with labels, as a PNG. Return their names.
 
-    They are the raw frame, the layers in the EXR of the latest round, and the last scene at this pose.
+    They are the raw frame, the layers of its latest round or image formation, and the last scene at its pose.
     """
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
@@ -281,7 +281,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
 
 def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield label and text of each line about a frame. ``--json`` has more."""
+    """Yield label and text of each line about a frame. ``--json`` prints more facts."""
     from cleargs.report.frames import CHOICES, EFFECTS, scores_of
 
     frame, judged = row.frame, facts["rva"]
@@ -320,10 +320,10 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
 
 
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:
-    """Print a table without lines. Without ``columns``, which are the heads, the first column holds labels.
+    """Print a table without rules. ``columns`` are its heads; without heads, the first column has labels.
 
-    Only the column with the head ``wraps`` may wrap; the columns are then closer together. Brackets in cells
-    are not treated as markup.
+    Only the column with the head ``wraps`` may wrap. With ``wraps`` the columns are closer together. Brackets
+    in cells are not treated as markup.
     """
     gap = (0, 1 if wraps else 2, 0, 0)
     table = Table(*columns, box=None, header_style="bold", padding=gap, pad_edge=False)

@@ -78,7 +78,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
 
 
 def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) -> Iterator[StoreFault]:
-    """Yield the differences between the present inputs of a stage outside the store and its manifest."""
+    """Yield the inputs of a stage outside the store that changed since its manifest was written."""
     stage = manifest.stage
     for role, place in dag.load(stage).externals(run.config.effective[stage], run.source).items():
         before = manifest.origins.get(role)

@@ -67,7 +67,7 @@ def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> No
 
 
 def capture_lines(out: Path, summary: dict[str, Any]) -> list[str]:
-    """Return the sentences on a synthetic capture that was written."""
+    """Return the lines that describe a new synthetic capture in ``out``."""
     frames, width = f"{summary['frames']} frames of {summary['protocol']!r}", summary["width"]
     lines = [f"{frames} in {out}; ground truth in {out / 'truth'}"]
     lines.append(_line("true blur", summary["blur_px"], width))

@@ -61,7 +61,7 @@ def handle_signals() -> None:
 
 
 class EscapingStream(io.TextIOWrapper):
-    """A text stream that escapes control and bidirectional characters, so that names cannot steer a terminal.
+    """A text stream that escapes control and bidirectional characters: file names cannot control a terminal.
 
     Line ends, tabs and colours stay. Characters that the encoding of the stream lacks are escaped too.
     """

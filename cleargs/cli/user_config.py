@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 DEFAULTS = ("store", "device", "threads", "quality")
-"""Entries of the file. All but ``threads`` are for new runs only: other commands follow the run."""
+"""Entries of the file. ``threads`` is for all commands, the others only for new runs."""
 
 
 def user_config_file() -> Path:

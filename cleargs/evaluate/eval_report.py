@@ -48,7 +48,7 @@ class Figures(FrozenModel):
 
 
 class Region(Figures):
-    """A part of an image, or of all of them."""
+    """A part of one image, or of all images."""
 
     share: float = Field(ge=0, le=1, description="Share of the pixels that count.")
     psnr: float | None = Field(description="dB, of its mean squared error; null if it is empty.")
@@ -58,10 +58,10 @@ class Alignment(Figures):
     """Transformation of the reference's poses into the scene's world."""
 
     world: Literal["scene", "ingest", "umeyama"] = Field(
-        description="scene: they are in it; ingest: by the similarity of ingest; umeyama: fitted to the "
-        "cameras of the frames of the same stem, because the run's poses are not the input's."
+        description="scene: none; ingest: the similarity of ingest; umeyama: a fit to the cameras of frames "
+        "with the same stems, because the run's poses are not those of the input."
     )
-    matched: int = Field(ge=0, description="References whose stem is that of a registered frame of the run.")
+    matched: int = Field(ge=0, description="Number of references with the stem of a registered frame.")
     residual: float | None = Field(
         None, ge=0, description="RMS distance of fitted centres, as a share of the trajectory's extent."
     )
@@ -76,7 +76,7 @@ class Refinement(Figures):
     rotation_deg: float = Field(ge=0, description="Angle turned, degrees.")
     shift: float = Field(ge=0, description="Distance that the camera centre moved, in the scene's units.")
     loss_before: float = Field(ge=0, description="Mean squared difference at full size, before.")
-    loss_after: float = Field(ge=0, description="The same at the pose that was taken.")
+    loss_after: float = Field(ge=0, description="Mean squared difference at full size, after.")
 
 
 class ImageResult(Figures):
@@ -215,18 +215,18 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             *(
                 column(f"{region}_{figure}", pa.float64(), words, nullable=True)
                 for region, where in _REGIONS.items()
-                for figure, words in (("share", f"of the pixels, {where}"), ("psnr", f"dB, {where}"))
+                for figure, words in (("share", f"of pixels {where}"), ("psnr", f"dB, of pixels {where}"))
             ),
             column(
                 "psnr_colour_aligned", pa.float64(), "dB, colours aligned to the reference", nullable=True
             ),
             column("psnr_white", pa.float64(), "dB, of the scene over white", nullable=True),
             column("psnr_between", pa.float64(), "dB, between background and white", nullable=True),
-            column("covered", pa.float64(), "share that Gaussians in mid-air cover", nullable=True),
+            column("covered", pa.float64(), "share of the image that floaters cover", nullable=True),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
             column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),
-            column("refined_rotation_deg", pa.float64(), "angle of pose refinement", nullable=True),
+            column("refined_rotation_deg", pa.float64(), "rotation by refinement, degrees", nullable=True),
             column(
                 "refined_shift", pa.float64(), "movement of the camera centre, scene units", nullable=True
             ),

@@ -1,4 +1,4 @@
-"""Evaluate a scene, or any other method's images, against sharp ones."""
+"""Evaluate a scene, or the images of any other method, against sharp reference images."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from cleargs.splat.scene import Scene
 from cleargs.types import ArrayF64, ImageU8, MaskBool, PlaneF32
 
 IN_FRONT = 0.85
-"""Depth, over that of the true surface, below which the centre of a Gaussian is in front of it."""
+"""Depth, divided by that of the true surface, below which the centre of a Gaussian is in front of it."""
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 
@@ -204,7 +204,7 @@ def _evaluate(
     reporter: Reporter,
     save: Path | None,
 ) -> Evaluation:
-    """Predictions are made one after the other (a render uses all threads) and measured in parallel."""
+    """Make predictions one after the other (a render uses all threads), and measure them in parallel."""
     measures = metrics.load_metrics(options)
     if save is not None:
         with disk_errors(save):
@@ -283,7 +283,7 @@ def _evaluate(
 
 
 def _digest(pixels: ImageU8, mask: MaskBool | None = None) -> str:
-    """SHA-256 of decoded pixels: the same for every lossless way to store them."""
+    """Return the SHA-256 of decoded pixels and mask: the same for every lossless way to store them."""
     digest = hashlib.sha256(f"{pixels.shape}".encode())
     digest.update(np.ascontiguousarray(pixels).tobytes())
     if mask is not None:

@@ -27,19 +27,19 @@ SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
 RIDGE = 1e-6
-"""It holds the directions of colour that an image does not show at the identity."""
+"""Weight that keeps the affine at the identity along the directions of colour that an image does not show."""
 
 FEWEST = 10
-"""Sparse points that a view must see before the farthest of them says anything."""
+"""Minimum number of sparse points that a view must see before its farthest depth is used."""
 
 FARTHEST = 0.99
-"""Quantile of their depths: a few are wrong matches, far behind everything."""
+"""Quantile of the depths of these points. A few points are wrong matches, far behind everything."""
 
 CLIPPED = 254
 
 
 def psnr(image: ImageU8, reference: ImageU8, mask: MaskBool | None = None) -> float | None:
-    """Peak signal-to-noise ratio in dB; infinite for equal images, None when no pixel counts."""
+    """Return the peak signal-to-noise ratio in dB: infinite for equal images, None if no pixel counts."""
     difference = image.astype(np.int64) - reference
     if mask is not None:
         difference = difference[mask]
@@ -50,11 +50,11 @@ def psnr(image: ImageU8, reference: ImageU8, mask: MaskBool | None = None) -> fl
 
 
 def ssim(image: ImageU8, reference: ImageU8, mask: MaskBool | None = None) -> float | None:
-    """Mean structural similarity (Wang et al., 2004) over pixels and channels; 1 for equal images.
+    """Return the mean structural similarity (Wang et al., 2004) over pixels and channels; 1 for equal images.
 
     Gaussian window of 11 x 11 pixels and sigma 1.5, data range 1, images mirrored at their border: the
     defaults of torchmetrics, which nerfstudio and gsplat report. (Inria's code pads with zeros, Wang's leaves
-    the border out.) Windows that hold a masked pixel do not count. None when no window counts.
+    the border out.) Windows with a masked pixel do not count. Returns None if no window counts.
     """
     x, y = image / 255.0, reference / 255.0
     mean_x, mean_y = _windowed(x), _windowed(y)
@@ -76,7 +76,7 @@ def _windowed(values: ArrayF64) -> ArrayF64:
 
 @dataclass(frozen=True)
 class MetricSet:
-    """The metrics of an evaluation, ready to be asked from several threads at once."""
+    """The loaded metrics of an evaluation. Several threads may use them at the same time."""
 
     lpips: dict[str, Callable[[ImageF32, ImageF32], float]]
     """Metric -> distance of two float32 sRGB images."""
@@ -89,7 +89,7 @@ class MetricSet:
     def measure(self, image: ImageU8, reference: ImageU8, mask: MaskBool | None) -> dict[str, float | None]:
         """Return all metrics of an image; unavailable ones are None.
 
-        For LPIPS, masked pixels are those of the reference. Scorers have no masks and use the whole image.
+        For LPIPS, masked pixels are replaced by the reference's. Scorers ignore the mask.
         """
         values = {"psnr": psnr(image, reference, mask), "ssim": ssim(image, reference, mask)}
         seen = image if mask is None else np.where(mask[..., None], image, reference)
@@ -101,9 +101,9 @@ class MetricSet:
 
 
 def load_metrics(options: EvalOptions) -> MetricSet:
-    """Load what ``options`` asks for. Weights that a user installs may be absent: their metrics will be null.
+    """Load the metrics in ``options``. Those whose weights the user has not installed will be null.
 
-    Raises InputError for a scorer of an unknown name or an unusable file.
+    Raises InputError for a scorer with an unknown name or an unusable file.
     """
     found = MetricSet({}, {}, {}, {})
     for net in options.lpips:
@@ -123,7 +123,7 @@ def load_metrics(options: EvalOptions) -> MetricSet:
 
 
 def fit_affine(image: ArrayF64, reference: ArrayF64, mask: MaskBool | None) -> ArrayF64:  # [3, 4]
-    """Matrix and offset of least squares on sRGB in [0, 1]; the identity when no pixel counts."""
+    """Return the least-squares affine from image to reference, sRGB in [0, 1]; identity without pixels."""
     x = image.reshape(-1, 3) if mask is None else image[mask]
     y = reference.reshape(-1, 3) if mask is None else reference[mask]
     identity = np.eye(3, 4)
@@ -141,7 +141,7 @@ def apply_affine(image: ArrayF64, affine: ArrayF64) -> ArrayF64:
     return np.asarray(np.einsum("hwj,ij->hwi", image, affine[:, :3]) + affine[:, 3]).clip(0.0, 1.0)
 
 
-# -- regions: the far, and the clipped, where scenes fail that look well on average ----------------------
+# -- regions in which scenes with good means may fail: far pixels and clipped pixels ---------------------
 
 
 def depth_of_points(points: ArrayF64, camera: Camera) -> float | None:
@@ -159,7 +159,7 @@ def depth_of_points(points: ArrayF64, camera: Camera) -> float | None:
 def far_pixels(depth: PlaneF32, alpha: PlaneF32, farthest: float) -> MaskBool:
     """Return True for pixels that show something behind ``farthest``, or are more than half transparent.
 
-    ``depth`` is summed with the weights of blending.
+    ``depth`` is the sum of depths times their blending weights.
     """
     return np.asarray((alpha < 0.5) | (depth > farthest * alpha))
 
@@ -177,7 +177,7 @@ def region(image: ImageU8, reference: ImageU8, part: MaskBool, mask: MaskBool | 
 
 
 def pooled(parts: Iterable[Region | None]) -> Region | None:
-    """Return the region over all images, with equal weights of the images and of their squared errors."""
+    """Return the region over all images. Each image counts equally, independent of its size."""
     found = [part for part in parts if part is not None]
     if not found:
         return None

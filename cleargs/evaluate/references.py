@@ -36,17 +36,17 @@ from cleargs.types import ArrayF64, ImageU8, MaskBool
 T = TypeVar("T")
 
 LARGE_RESIDUAL = 0.02
-"""Above this share of the trajectory's extent the fit of two worlds causes a warning."""
+"""Residual of a fit of two worlds, as a share of the trajectory's extent, above which there is a warning."""
 
 MAX_RESIDUAL = 0.05
-"""Above this share it is an error: each view would be rendered far from its reference."""
+"""Residual above which there is an error: each view would be rendered far from its reference."""
 
 SAME_VIEW = 0.05
-"""Two views are the same if their centres are closer than this (the trajectory reaches 1 from its middle),
-and their axes than this in radians. Pose noise is smaller, and the next view of a set mostly farther."""
+"""Two views are the same if their centres are closer than this (the farthest camera is 1 from the mean), and
+their angle is below this, rad. Pose noise is smaller, and the next view of a set is mostly farther."""
 
-_ROUNDING = 1e-9  # extent of centres, relative to their coordinates, below which they are one place
-_FLAT = 1e-3  # second-largest over largest extent of centres below which the turn about their line is open
+_ROUNDING = 1e-9  # extent of centres, relative to their coordinates, below which they count as one place
+_FLAT = 1e-3  # second-largest over largest extent of centres below which they count as one line
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class ReferenceView:
     depth: Path | None = None
     """EXR of the true depth, as `cleargs synth` writes it; None if it is not known."""
     unit: float = 1.0
-    """Length in that file of a unit of the scene."""
+    """Length of a unit of the scene, in the units of ``depth``."""
 
     @property
     def pose(self) -> Pose:
@@ -144,12 +144,12 @@ def reference_of(
         found = _reference(directory.resolve().name, views, poses, alignment)
     try:
         return replace(found, points=load_points(ingest).xyz)
-    except StoreError:  # figures of what lies behind them are left out
+    except StoreError:  # without points, there are no figures of the far region
         return found
 
 
 def matching(found: Iterable[str], wanted: Iterable[str], hint: str) -> list[str]:
-    """Return the stems on both sides. Raises InputError, with two examples of each, if there is none."""
+    """Return the stems in both ``found`` and ``wanted``. Raises InputError if there is none."""
     stems = sorted({*found} & {*wanted}, key=natural_key)
     if not stems:
         raise InputError(
@@ -192,14 +192,14 @@ def _run_pose(frame: Frame) -> Pose:
 
 
 def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Similarity, Alignment]:
-    """Return the similarity that fits cameras best by place and direction, and its residuals.
+    """Return the similarity that maps cameras best, by position and direction, and its residuals.
 
-    ``source`` are cameras in the world to leave, ``target`` the same ones in the world to enter.
+    ``source`` and ``target`` are the same cameras, in the world to map from and in the world to map to.
 
-    The centres of a handheld walk are near a line or a plane and fix only poorly the turn: half a degree may
-    be left, which costs an image decibels. They only fix the size. Then each camera counts as four points:
-    its centre, and one on each axis at the distance by which the centres spread. Raises InputError for fewer
-    than three cameras, or for centres on one line.
+    The centres of a handheld walk are near a line or a plane, so they fix the rotation poorly: an error of
+    half a degree may remain, which costs an image decibels. Therefore the centres give only a first scale.
+    Then each camera counts as four points: its centre, and one on each axis at the distance by which the
+    centres spread. Raises InputError for fewer than three cameras, or for centres on one line.
     """
     theirs, ours = (np.stack([pose.centre for pose in poses]) for poses in (source, target))
     scale = umeyama(theirs, ours).scale
@@ -242,7 +242,7 @@ def umeyama(source: ArrayF64, target: ArrayF64) -> Similarity:
     mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * mirror) @ vt
     scale = float((stretch * mirror).sum() / ((a * a).sum() / len(a)))
-    # The similarity of ingest divides by its scale: x_target = rotation (x_source - origin) / (1 / scale).
+    # `Similarity` divides by its scale: x_target = rotation (x_source - origin) / (1 / scale).
     return Similarity(rotation, source_mean - rotation.T @ target_mean / scale, 1.0 / scale)
 
 

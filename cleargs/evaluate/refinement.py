@@ -1,4 +1,4 @@
-"""Refinement of the pose at which a scene is rendered: the one that explains a reference image best.
+"""Refinement of the pose of a render, so that the render explains a reference image best.
 
 Levenberg-Marquardt on the photometric difference, first at a reduced size, then at full size. The kernels
 give no gradient of the camera, so the six columns of the Jacobian are central differences.
@@ -18,10 +18,10 @@ from cleargs.splat.camera import Camera
 from cleargs.types import ArrayF64, ImageU8, MaskBool
 
 Render = Callable[[Camera], ArrayF64]
-"""Gives [H, W, 3] sRGB in [0, 1]."""
+"""A function that returns the render at a camera, [H, W, 3] sRGB in [0, 1]."""
 
 LONG_SIDE = 320
-"""Reduced size, px: steps reach farther there."""
+"""Long side of the reduced images, px. At this size, steps reach farther."""
 
 _BLUR = 1.0  # px of the reduced image; widens the reach of a step to a few pixels
 _DIFFERENCE = 0.25  # px that a probing movement shifts the image
@@ -38,13 +38,11 @@ def refine_pose(
 ) -> tuple[Camera, Refinement]:
     """Return ``camera`` with the pose that lowers the mean squared difference, after ``steps`` steps.
 
-    Half of the steps are at full size.
-
-    A pose is taken only where the difference at full size falls: a pose that fits reduced, blurred images
-    better may be worse there.
+    Half of the steps are at full size. A pose is accepted only if the difference at full size falls: a pose
+    that fits reduced, blurred images better may be worse at full size.
 
     ``distance`` is a typical distance of the scene. It makes a unit of movement shift the image as much as a
-    unit of turning does.
+    unit of rotation does.
     """
     fine = max(1, round(_FINE * steps))
     small = camera.scaled(min(1.0, LONG_SIDE / max(camera.width, camera.height)))
@@ -92,7 +90,7 @@ class _Comparison:
 
 def _descend(comparison: _Comparison, pose: Camera, distance: float, steps: int) -> Camera:
     """Return ``pose`` after ``steps`` steps. A step that does not lower the difference is not taken."""
-    # Turn (rad) and movement (scene units) that shift the image by a pixel.
+    # Rotation (rad) and movement (scene units) that shift the image by a pixel.
     pixel = np.repeat([1.0 / pose.fx, distance / pose.fx], 3)
     residual = comparison.difference(pose)
     lowest = comparison.mean_square(residual)
@@ -121,7 +119,7 @@ def _descend(comparison: _Comparison, pose: Camera, distance: float, steps: int)
 
 
 def apply_twist(camera: Camera, twist: ArrayF64) -> Camera:
-    """``camera`` turned (``twist[:3]``, rotation vector) and moved (``twist[3:]``) in its own axes."""
+    """Return ``camera`` rotated (vector ``twist[:3]``) and moved (``twist[3:]``) in its own axes."""
     step = np.eye(4)
     step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
     step[:3, 3] = twist[3:]
@@ -129,5 +127,5 @@ def apply_twist(camera: Camera, twist: ArrayF64) -> Camera:
 
 
 def rotation_between(a: ArrayF64, b: ArrayF64) -> float:  # [3, 3] each
-    """Angle between two rotations, degrees."""
+    """Return the angle between two rotations, degrees."""
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))

@@ -1,4 +1,4 @@
-"""Image formation: colour, motion blur, rolling shutter and defocus, and the search for their numbers.
+"""Image formation: colour, motion blur, rolling shutter and defocus, and the estimation of their parameters.
 
 A raw frame is compared with the render *as its camera saw it*:
 

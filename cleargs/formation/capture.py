@@ -1,15 +1,15 @@
-"""The formation of every frame of a capture, found while a scene is trained on them.
+"""The formation of every frame of a capture, estimated while a scene is trained on the frames.
 
-The first look at a frame searches it, except in a draft, and in a capture that the frames before have
-shown to be sharp. The next looks follow after every `FormationConfig.every` steps on it. They refine its
-motion with the scene of that time. A test of a few milliseconds (`pretest`) says if blur is left that nothing
-explains, and only then the frame is searched again. The sharper the scene becomes, the more blur the test
-finds. At the fourth look after the first one, at the eighth, and whenever their number has doubled, a path of
-a higher order is tried.
+A *look* is a new estimate of a frame's formation. The first look *searches* the frame: it fits all models
+from scratch. Further looks follow after every `FormationConfig.every` steps on the frame. They refine its
+motion with the current scene. The frame is searched again only if a test of a few milliseconds (`pretest`)
+finds blur that the model does not explain; a sharper scene reveals more of it. In a draft, or if earlier
+frames show that the capture is sharp, this condition also holds for the first look. At the fourth look after
+the first one, the eighth, the sixteenth and so on, a path of a higher order is tried.
 
-Later trainings continue with the formations of the first one, and count on. They keep the formation of a
-frame that earlier trainings have looked at `SETTLED` times. If the shutter rolls, they keep none, and every
-frame is searched at the first look of a training and at these looks, since the test cannot see a skew.
+Later trainings continue with the formations and the numbers of looks of the first one. They keep the
+formation of a frame that had `SETTLED` looks. If the shutter rolls, they keep none. The test cannot detect a
+skew, so every frame is then searched at the first look of a training, and whenever a higher order is tried.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from cleargs.splat.views import TrainingView
 from cleargs.types import MaskBool
 
 ROLLING_START = 0.1
-"""Share of the schedule from which frames are tested for a rolling shutter. A scene learns to look like
-skewed frames. At a place that few frames see, it hides a skew before `FormationConfig.start`
+"""Fraction of the schedule from which frames are tested for a rolling shutter. The scene gradually learns the
+skew of the frames. At places that few frames see, it hides their skew before `FormationConfig.start`
 (docs/experiments/formation.md)."""
 DOUBTED = 0.5
-"""Weight by RVA below which a frame is doubted."""
+"""RVA weight below which a frame is doubted: less blur is then enough for a search."""
 AGAIN = 4
-"""Looks at a frame from the first one to the next try of a higher order, and where the shutter rolls to the
-next search. After that their number doubles from one to the next: the scene changes less and less."""
+"""Number of looks from the first one to the next try of a higher order and, if the shutter rolls, to the next
+search. It doubles from one try to the next, because the scene changes less and less."""
 SETTLED = 7
 """Looks at a frame after which later trainings keep its formation. Scenes lost nothing after 7 and 15 looks,
 and up to 0.2 dB after 3 (docs/experiments/formation.md)."""
 SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
-"""Share of frames with a model up to which a capture is sharp, and the fewest frames that tell. In a sharp
-capture a frame is not searched at its first look, unless the test finds blur."""
+"""A capture is sharp if at most this share of the frames that had a look need a model, and at least this many
+had one. In a sharp capture a frame is searched at its first look only if the test finds blur."""
 
 
 def median_misfit(frames: Iterable[FrameFormation], weights: Mapping[int, float]) -> float:
-    """Return the median misfit, in which each frame counts with its weight by RVA; 0 where none is known."""
+    """Return the median misfit (difference from the render), weighted by ``weights``; 0 if none is known."""
     known = sorted((frame.misfit, weights.get(frame.frame_id, 0.0)) for frame in frames if frame.misfit > 0.0)
     half, passed = 0.5 * math.fsum(weight for _, weight in known), 0.0
     for misfit, weight in known:
@@ -64,19 +64,19 @@ def median_misfit(frames: Iterable[FrameFormation], weights: Mapping[int, float]
 
 
 class CaptureFormation:
-    """Fulfils `cleargs.splat.formation.Formation` for a capture."""
+    """Image formation of a capture, an implementation of `cleargs.splat.formation.Formation`."""
 
     def __init__(
         self,
         views: Sequence[TrainingView],
         config: FormationConfig,
         *,
-        exposure: Exposure | None = None,  # colour affines to begin with; None: a training without any
+        exposure: Exposure | None = None,  # initial colour affines; None: no exposure compensation
         lr_exposure: float = 0.0,  # learning rate of the affines
         known: Mapping[int, FrameFormation] | None = None,  # from an earlier training, by frame_id
-        moving: Mapping[int, MaskBool] | None = None,  # cells that move, likewise
-        tolerance: float = 0.0,  # difference of mean colours from which a cell can move; 0: none is added
-        draft: bool = False,  # search frames only where the test finds blur, also at the first look
+        moving: Mapping[int, MaskBool] | None = None,  # cells that move, from an earlier training
+        tolerance: float = 0.0,  # difference of mean sRGB colours above which a cell can move; 0: no looks
+        draft: bool = False,  # search a frame only if the test finds blur, also at the first look
     ) -> None:
         weighted = [view for view in views if view.weight > 0.0]
         self._config, self._draft = config, draft
@@ -85,7 +85,7 @@ class CaptureFormation:
         real = [view.frame_id for view in filmed]
         known = known or {}
         self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
-        if self._rolls():  # a training begins with a search
+        if self._rolls():  # a training begins with a search of each frame
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         enough = (SETTLED - 1) * config.every
         self._settled = {frame_id for frame_id, frame in self._frames.items() if frame.draws > enough}
@@ -100,7 +100,7 @@ class CaptureFormation:
 
     @property
     def exposure(self) -> Exposure | None:
-        """The affines learned so far; None where exposure is off."""
+        """The affines learned so far; None if exposure compensation is off."""
         return None if self._affines is None else self._affines.exposure
 
     @property
@@ -110,17 +110,17 @@ class CaptureFormation:
 
     @property
     def moving(self) -> dict[int, MaskBool]:
-        """Cells that move [rows, columns], of the frames in which some do, by frame_id."""
+        """Cells that move [rows, columns], by frame_id, for frames in which something moves."""
         return self._movement.masks()
 
     def weight(self, frame_id: int) -> float:
-        """Return the weight of a raw frame in the training: RVA's, or what it has earned if that is more.
+        """Return the weight of a raw frame in the training: RVA's weight, or its trust if that is larger.
 
             w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
 
-        rho is the median misfit of the frames, each counted with its w_RVA, and p is `FormationConfig.trust`.
-        A frame that is explained as well as reliable frames are has the weight of one, with a model of its
-        exposure or without: RVA takes soft things, such as fur, for a soft photograph.
+        rho is the median misfit of the frames, weighted by w_RVA, and p is `FormationConfig.trust`. A frame
+        that is explained as well as reliable frames counts like one of them, also if it needs no model: RVA
+        can mistake a sharp photograph of soft things, such as fur, for a blurred one.
         """
         prior, frame = self._weights[frame_id], self._frames[frame_id]
         if frame.misfit <= 0.0:  # not compared with the scene so far
@@ -145,7 +145,7 @@ class CaptureFormation:
         own, mask = mask, self._movement.still(frame_id, mask, target)
 
         def explained() -> FrameFormation:
-            """Return the frame's formation, estimated with the present scene."""
+            """Return the frame's formation, estimated with the current scene."""
             frame = self._frames[frame_id]
             return fit_motion(
                 frame,
@@ -225,7 +225,7 @@ class CaptureFormation:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Resume from what `state` gave."""
+        """Continue from the result of `state`."""
         self._movement.restore(state)
         self._draws = dict(zip(self._draws, state["movement.draws"].tolist(), strict=True))
         self._frames = {frame.frame_id: frame for frame in unpacked(state["frames"].numpy())}
@@ -234,7 +234,7 @@ class CaptureFormation:
             self._affines.restore({name: tensor.numpy() for name, tensor in affines.items()})
 
     def fault(self) -> str | None:
-        """Return the name of what is not finite; None if all numbers are."""
+        """Return a description of values that are not finite, or None."""
         if self._affines is not None and not np.isfinite(self._affines.affines).all():
             return "exposure is not finite"
         return None
@@ -243,9 +243,9 @@ class CaptureFormation:
         return rolls(self._frames.values())
 
     def _asks(self, frame_id: int) -> bool:
-        """Return True if a frame is still to be tested for a rolling shutter.
+        """Return True if a frame must still be tested for a rolling shutter.
 
-        Once more than half of the tested frames show none, the others cannot change the median.
+        Once more than half of the frames to test show no skew, the others cannot change the median.
         """
         if frame_id not in self._tested or self._frames[frame_id].skew_gain is not None:
             return False
@@ -258,12 +258,12 @@ class CaptureFormation:
         return draws == 0 or (draws % self._config.every == 0 and frame_id not in self._settled)
 
     def _all_looked_at(self, frame_id: int) -> bool:
-        """Return True if a look at this frame was the last one of a round of looks at all frames."""
+        """Return True if a look at this frame completes a round of looks at all frames."""
         before = self._frames[frame_id].draws
         return all(frame.draws > before for k, frame in self._frames.items() if k != frame_id)
 
     def _add_missing_skew(self) -> None:
-        """Give all frames the skew that they lack in common. The scene follows until the next look."""
+        """Add the skew that all frames lack in common (`shutter`). The scene adapts until the next look."""
         if self._speeds is None or not self._rolls():
             return
         missing = self._speeds.missing_skew(self._frames)
@@ -278,13 +278,13 @@ class CaptureFormation:
 
 
 def _searched_again(looks: int) -> bool:
-    """Return True for 0, `AGAIN` and its doubles: 0, 4, 8, 16, 32, ..."""
+    """Return True for 0 and for `AGAIN` times a power of two: 0, 4, 8, 16, 32, ..."""
     rounds, rest = divmod(looks, AGAIN)
     return rest == 0 and rounds & (rounds - 1) == 0
 
 
 def _affines(exposure: Exposure, views: Sequence[TrainingView], rate: float) -> AffineOptimiser:
-    """Return affines for all frames; the median counts the weights of the real views."""
+    """Return the optimiser of the affines of all frames. Only real views have a weight in its median."""
     frame_ids = np.union1d(exposure.frame_ids, [view.frame_id for view in views]).astype(np.int32)
     weights: NDArray[np.float64] = np.zeros(len(frame_ids))
     for view in views:

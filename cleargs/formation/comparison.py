@@ -1,7 +1,7 @@
 """Comparison of a raw frame and a render under a motion, at one size.
 
-The difference of high-passed luminance in linear light counts. A quarter of the pixels, in blocks, takes no
-part in a fit. These pixels decide which model explains the frame.
+The *misfit* is the mean difference of high-passed luminance in linear light. A quarter of the pixels, in
+blocks, is held out from every fit. The misfit on the held-out pixels decides which model explains the frame.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from cleargs.types import ArrayF32, ArrayF64
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
 NEAR_SIZE = 1.5
-"""An image that is larger than a level by less than this factor takes the place of that level."""
+"""A frame at full size replaces the finest level below its size if it is larger by less than this factor."""
 
 FINE, COARSE = samples(13), samples(9)
 """Sample times of an exposure."""
 DISC = samples(32)
 
 HIGH_PASS = 6.0
-"""Standard deviation, px, of the Gaussian whose blur is subtracted from both images. Slow differences, as
-those of light are, contain no motion."""
+"""Standard deviation, px, of the Gaussian whose blur is subtracted from both images. Differences of low
+frequency, such as those of illumination, say nothing about motion."""
 
 OUTLIER, LIMIT = 0.03, 0.1
-"""Differences of linear light: from the first on they count linearly, from the second on no further."""
+"""Differences of linear light. Fits count those above `OUTLIER` linearly; misfits count at most `LIMIT`."""
 
 MIN_MISFIT = 5e-4
 """Misfit, in linear light, below which there is nothing to explain: the error of rounding to eight bits."""
@@ -49,7 +49,7 @@ class FramePair:
     """A raw frame and the render that should explain it.
 
     ``luminance``, ``depth`` and ``alpha`` of the render are larger than the frame by ``margin`` pixels on
-    every side; ``camera`` is the frame's.
+    every side. ``camera`` is that of the frame.
     """
 
     luminance: ArrayF32  # [H + 2 margin, W + 2 margin] linear light
@@ -70,16 +70,16 @@ class MotionFit:
     misfit: float
     """Mean difference that remains on the held-out pixels, each at most `LIMIT`."""
     misfit_still: float
-    """The same without any motion."""
+    """Misfit without any motion."""
 
     @property
     def explained(self) -> float:
-        """Share of the misfit that the model takes away."""
+        """Share of the misfit that the model removes."""
         return explained_share(self.misfit, self.misfit_still)
 
 
 def explained_share(misfit: float, misfit_still: float) -> float:
-    """Return the share of ``misfit_still`` that is gone in ``misfit``; 0 where there was almost nothing."""
+    """Return 1 - ``misfit`` / ``misfit_still``, or 0 if ``misfit_still`` is at most `MIN_MISFIT`."""
     return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
 
 
@@ -103,7 +103,7 @@ def scales(pair: FramePair) -> list[float]:
 
 
 class Level:
-    """The problem at one size."""
+    """The comparison of a frame and a render at one size."""
 
     def __init__(self, pair: FramePair, scale: float) -> None:
         """Reduce both images to ``scale`` times the size of the frame."""
@@ -115,7 +115,7 @@ class Level:
             return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
         inner = np.s_[margin : height - margin, margin : width - margin]
-        # Outside the frame the render replaces it, so that both are high-passed alike at the border.
+        # Around the frame, both images show the render, so that both are high-passed alike at the border.
         observed, weight = pair.luminance.copy(), np.zeros_like(pair.luminance)
         observed[inner], weight[inner] = pair.observed, pair.weight
         self._image, self._observed = _high_passed(reduced(pair.luminance)), _high_passed(reduced(observed))
@@ -178,7 +178,7 @@ class Level:
         return MotionFit(model, motion, misfit, self._still)
 
     def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:
-        """Return the sum of the differences on the pixels that fit."""
+        """Return the sum of the differences on the pixels that are not held out."""
         return self._misfit(motion, times, self._fitting)
 
     def _misfit(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
@@ -224,7 +224,7 @@ class Level:
 
 
 def finest_level(pair: FramePair) -> Level:
-    """Return the problem at the largest size at which a frame is compared."""
+    """Return the comparison at the largest size at which a frame is compared."""
     return Level(pair, scales(pair)[-1])
 
 

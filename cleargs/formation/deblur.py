@@ -1,4 +1,4 @@
-"""A raw frame without the motion that blurred and skewed it, or the defocus."""
+"""Removal of the estimated blur, skew or defocus from a raw frame."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.types import ArrayF32
 
 PRIOR = 0.1
-"""Variance of the part that the model of the exposure leaves unexplained, over that of the render's error.
+"""Variance of the part of a frame that its formation does not explain, over that of the error of the render.
 Frequencies that the exposure passes with more than this share of their power come from the raw frame, the
 others from the render."""
 
 OUTLIER = 0.15
-"""Difference in sRGB between raw frame and exposed render from which a pixel counts less, since it shows a
-thing that moved."""
+"""Difference in sRGB between raw frame and exposed render above which a pixel counts less, since it may show
+something that moved."""
 
 STEPS = 10
 """Steps of the solver; fifty more change the image by less than 1/255 on average."""
 
 MIN_LINEAR = 0.002
-"""Linear light below which the slope of sRGB is taken as here."""
+"""Linear light below which the slope of sRGB is that at this value."""
 
 
 def deblur(
@@ -34,14 +34,14 @@ def deblur(
     weight: ArrayF32,  # [H, W], 0 where a pixel of ``observed`` does not count
     warp: Warp,
 ) -> ArrayF32:  # [H, W, 3] sRGB in [0, 1]
-    """Return the sharp image that explains ``observed`` under the frame's formation B.
+    """Return the sharp image X that explains ``observed`` under the formation B of the frame (``warp``).
 
-    It is that of ``render`` where B leaves it undetermined:
+    X follows ``render`` where B leaves it undetermined:
 
         argmin_X  |s (B X - O)|^2 + PRIOR |s (X - R)|^2
 
-    s is the slope of sRGB over linear light, so that differences count as they are seen. Solved by conjugate
-    gradients from X = R.
+    s is the slope of sRGB over linear light, so that differences count as in sRGB. Conjugate gradients start
+    from X = R.
     """
     start, target = padded(linear_from_srgb(render)), padded(linear_from_srgb(observed))
     forward, transpose = _on_arrays(warp.forward, warp), _on_arrays(warp.transpose, warp)
@@ -55,7 +55,7 @@ def deblur(
     seen = _slope(start)
 
     def normal(change: ArrayF32) -> ArrayF32:
-        """Apply the normal equations of the change in sRGB: dark and bright parts then converge alike."""
+        """Apply the matrix of the normal equations in sRGB: dark and bright parts then converge alike."""
         return transpose(data * forward(change / seen)) / seen + np.float32(PRIOR) * change
 
     change = _conjugate_gradients(normal, transpose(data * left) / seen)
@@ -65,7 +65,7 @@ def deblur(
 
 
 def _on_arrays(operator: Callable[[Tensor], Tensor], warp: Warp) -> Callable[[ArrayF32], ArrayF32]:
-    """Return one direction of a warp as a function of arrays, on whatever device its fields are."""
+    """Return one direction of a warp as a function of arrays. It runs on the device of the warp."""
 
     def called(image: ArrayF32) -> ArrayF32:
         return np.asarray(operator(torch.from_numpy(image).to(warp.samples.device)).cpu())

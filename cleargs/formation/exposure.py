@@ -1,8 +1,8 @@
-"""Exposure compensation: one affine on sRGB per frame, learned with the scene where a capture needs it.
+"""Exposure compensation: one affine on sRGB per frame, learned with the scene if a capture needs it.
 
-The affines start from the gains that the sparse points show. Their median, weighted as the frames are, stays
-the identity: scene and affines cannot drift apart together, and a few badly exposed frames do not make the
-scene darker or brighter.
+The affines start from gains that are measured at the sparse points. Their weighted median stays the identity.
+This prevents a common drift of scene and affines, and a few badly exposed frames do not make the scene darker
+or brighter.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MIN_POINTS = 20
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """The affine of every frame: shown colour = affine[:, :3] @ scene colour + affine[:, 3]."""
+    """The affine of every frame: frame colour = affine[:, :3] @ scene colour + affine[:, 3], in sRGB."""
 
     frame_ids: NDArray[np.int32]  # [F] ascending
     affines: NDArray[np.float64]  # [F, 3, 4]
@@ -47,7 +47,7 @@ class Exposure:
     def from_gains(cls, frame_ids: Sequence[int], gains: NDArray[np.float64]) -> Exposure:
         """Return the exposure that brightens each frame by its gain over the median gain.
 
-        Frames are distinct. A gain [F] is NaN for a frame that is not changed.
+        ``frame_ids`` must be distinct. A frame whose gain [F] is NaN is not changed.
         """
         known = gains[np.isfinite(gains)]
         relative = gains / np.median(known) if len(known) else gains
@@ -61,7 +61,7 @@ class Exposure:
         return bool((self.affines != IDENTITY).any())
 
     def of(self, frame_id: int) -> NDArray[np.float64]:
-        """Return the affine [3, 4] of a frame; the identity where it has none."""
+        """Return the affine [3, 4] of a frame; the identity if it has none."""
         index = np.flatnonzero(self.frame_ids == frame_id)
         return self.affines[index[0]] if len(index) else IDENTITY
 
@@ -69,7 +69,7 @@ class Exposure:
 def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Shift the affines [F, 3, 4] so that the median of each entry is that of the identity.
 
-    It is the lower median, weighted by ``weights`` [F].
+    The median is the lower one, weighted by ``weights`` [F].
     """
     total = weights.sum()
     if total <= 0.0:
@@ -83,8 +83,8 @@ def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArr
 def frame_gains(views: Sequence[TrainingView], sparse: SparsePoints) -> NDArray[np.float64]:
     """Return the gain of each view, its brightness over the average: [V], NaN where unknown.
 
-    It is the median, over the sparse points that a view observes, of the view's pixel at the projection of
-    the point over the colour of the point (sums of sRGB).
+    The gain is the median of a ratio over the sparse points that the view observes: the pixel at the
+    projection of the point over the colour of the point (both as sums of the sRGB channels).
     """
     gains = np.full(len(views), np.nan)
     for index, (view, seen) in enumerate(zip(views, sparse.observed, strict=True)):
@@ -132,10 +132,10 @@ def read_exposure(path: Path) -> Exposure:
 
 
 class AffineOptimiser:
-    """Adam on the affines. Only the frame just seen moves, and the weighted median stays the identity."""
+    """Adam for the affines. A step changes one frame's affine; then all are shifted as in `centred`."""
 
     def __init__(self, exposure: Exposure, weights: NDArray[np.float64], rate: float) -> None:
-        """Begin at ``exposure`` of all frames, which have ``weights`` [F] in the median."""
+        """Start from ``exposure`` of all frames. ``weights`` [F] are their weights in the median."""
         self.frame_ids = exposure.frame_ids
         self.affines = centred(exposure.affines, weights)
         self.first = np.zeros_like(self.affines)
@@ -147,7 +147,7 @@ class AffineOptimiser:
 
     @property
     def exposure(self) -> Exposure:
-        """A copy of the present affines."""
+        """A copy of the current affines."""
         return Exposure(self.frame_ids.copy(), self.affines.copy())
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -155,7 +155,7 @@ class AffineOptimiser:
         return {"affines": self.affines, "first": self.first, "second": self.second, "steps": self.steps}
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Resume from what `arrays` gave."""
+        """Continue from the result of `arrays`."""
         self.affines, self.first = arrays["affines"], arrays["first"]
         self.second, self.steps = arrays["second"], arrays["steps"]
 

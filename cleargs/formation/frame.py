@@ -1,4 +1,8 @@
-"""Formation of one frame, and its estimation with a scene."""
+"""Image formation of one frame, and its estimation with a scene.
+
+The *misfit* of a frame is its mean difference from the render (`comparison`). *Evidence* is the share of the
+squared error that further blur would explain (`pretest`). A *search* fits all models from scratch (`search`).
+"""
 
 from __future__ import annotations
 
@@ -32,14 +36,14 @@ from cleargs.splat.kernels.warp_layout import BEND_REACH, CHANNELS, CUBE_REACH, 
 from cleargs.splat.types import Render
 
 EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
-"""Share of the squared error on unseen tiles that further blur must explain before a frame is searched; the
-second holds for frames that RVA doubts. Both are from tuning captures (docs/experiments/formation.md)."""
+"""Evidence of blur above which a frame is searched. The second value is for frames that RVA doubts. Both are
+from tuning captures (docs/experiments/formation.md)."""
 WORSE = -0.03
-"""Share of the misfit that half of the tested blur must explain before a frame of a sharp capture is
-searched. Wrong geometry can pass for a blur in the test, but a blur makes the render less like such a frame.
-Source: docs/experiments/formation.md."""
+"""Threshold of a check before a frame without a model is searched in a sharp capture: half of the blur that
+the test found must not raise the misfit by 3 % or more. Wrong geometry can look like blur in the test, but
+blurring the render then makes it less like the frame (docs/experiments/formation.md)."""
 GROWN_EVIDENCE = 1.25
-"""Factor by which that share must have grown since the last search before a frame is searched again."""
+"""Factor by which the evidence must have grown since the last search before a frame is searched again."""
 SEARCHED_SHARE = 0.05
 """Margin of a search, as a share of the longer side."""
 
@@ -50,13 +54,13 @@ MARGIN_SHARE = 0.25
 
 LENS = ("disc_px", "focus", "median_depth")
 MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
-"""Numbers of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
+"""Fields of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
 class FrameFormation:
-    """The formation of one frame, as far as it is known."""
+    """The current estimate of a frame's formation. Lengths are in pixels of the full image."""
 
     frame_id: int
     motion: FrameMotion = field(default_factory=FrameMotion)
@@ -65,24 +69,24 @@ class FrameFormation:
     """Mean difference of high-passed linear luminance that the model leaves, see `comparison.MotionFit`."""
     misfit_still: float = 0.0
     blur_px: float = 0.0
-    """Mean length of the pixels' paths while they were exposed."""
+    """Mean length of the pixels' paths during the exposure."""
     skew_px: float = 0.0
-    """Mean length of their paths from the first to the last row's exposure."""
+    """Mean length of the pixels' paths from the first to the last row's exposure."""
     defocus_px: float = 0.0
-    """Mean radius of the discs."""
+    """Mean radius of the discs of defocus."""
     reach_px: float = 0.0
-    """Farthest that a pixel looks from its place (95 % of them look less far)."""
+    """Largest displacement of a pixel's samples along an axis: the 95th percentile over the pixels."""
     skew_gain: float | None = None
-    """Share of the misfit that a rolling shutter explains beyond blur and defocus, by the last search; None
-    where none was made."""
+    """Share of the misfit that a rolling shutter explains beyond blur and defocus, by the last search that
+    tried one; None if none did."""
     evidence: float = 0.0
-    """Least share of the squared error that further blur explained since the last search."""
+    """Least evidence of further blur since the last search."""
     draws: int = 0
-    """Steps on the frame since the first estimate of its formation."""
+    """Training steps on the frame since the first estimate of its formation."""
 
     @property
     def explained(self) -> float:
-        """Share of the misfit that the model takes away."""
+        """Share of the misfit that the model removes."""
         return explained_share(self.misfit, self.misfit_still)
 
 
@@ -108,13 +112,13 @@ def fit_motion(
     rolling: bool = False,  # admit models with a skew
     test_rolling: bool = False,  # measure `skew_gain` even where no such model is admitted
     again: bool = False,  # try a higher order, and search a frame with a curved path or a rolling shutter
-    sparing: bool = False,  # the first time, too, search only for a blur of the test that `_resembled` admits
+    sparing: bool = False,  # also the first time, search only for a blur that the test and `_resembled` admit
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
-    The first time, the frame is searched. Later a known formation is refined, and the frame is searched only
-    if the test of `pretest` finds blur that the present model does not explain and that the last search did
-    not leave, or if a rolling shutter is asked for, since the test cannot see a skew.
+    The known formation is refined. The first time, the frame is also searched. Later it is searched only if
+    the test of `pretest` finds blur that the model does not explain and that the last search did not leave,
+    or if a rolling shutter must be tested, since that test cannot detect a skew.
     """
     # A formation that was found under the other assumption about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
@@ -159,15 +163,12 @@ def fit_motion(
 
 
 def _accepted(best: MotionFit, still: MotionFit, before: Model, config: FormationConfig) -> MotionFit:
-    """Return ``best`` where it explains enough, else ``still``.
-
-    The model of ``before`` may stay at half the gain that admits a new one.
-    """
+    """Return ``best`` if it explains enough, else ``still``. The model ``before`` needs only half as much."""
     return best if best.explained >= config.accept * (0.5 if best.model == before else 1.0) else still
 
 
 def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvidence:
-    """Return how much blurrier the frame is than the render as its camera saw it under ``fit``."""
+    """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
     shown = pair.luminance
     if fit.model != "none":
         assert rendered.depth is not None
@@ -181,7 +182,7 @@ def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvide
 
 
 def _resembled(pair: FramePair, evidence: BlurEvidence) -> bool:
-    """Return True unless half of the blur that the test found makes the render less like the frame."""
+    """Return True unless half of the blur that the test found raises the misfit too much (`WORSE`)."""
     level = finest_level(pair)
     blur = replace(blur_along(0.5 * evidence.length, evidence.angle), median_depth=level.median)
     return level.evaluate("blur", blur).explained > WORSE
@@ -192,7 +193,7 @@ def _admitted(model: Model, rolling: bool) -> bool:
 
 
 def _skew_gain(found: list[MotionFit]) -> float:
-    """Return the share of the misfit that remains without a skew and is gone with one."""
+    """Return the share by which the best model with a skew reduces the misfit of the best one without."""
     still = preferred([e for e in found if _admitted(e.model, rolling=False)])
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
     return max(0.0, explained_share(rolled.misfit, still.misfit))
@@ -272,7 +273,7 @@ def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
 
 
 def margin_for(reach: float, camera: Camera) -> int:
-    """Return the margin, px, that shows the pixels which moved in from outside the border."""
+    """Return the margin, px, that contains the pixels that moved in from outside the border."""
     largest = int(MARGIN_SHARE * min(camera.width, camera.height)) // MARGIN_STEP * MARGIN_STEP
     return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
 
@@ -288,7 +289,7 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame whose `as_row` this is. Older tables lack ``draws``, curves and ``evidence``."""
+    """Return the frame of a row from `as_row`. Older tables lack ``draws``, curves and ``evidence``."""
     vector = np.array([row.get(f"{name}_{axis}") or 0.0 for name in TWISTS for axis in AXES])
     return FrameFormation(
         row["frame_id"],
@@ -301,7 +302,7 @@ def from_row(row: Mapping[str, Any]) -> FrameFormation:
 
 
 def packed(frames: Iterable[FrameFormation]) -> NDArray[np.float64]:
-    """Return the frames for a checkpoint, [F, numbers of one]."""
+    """Return the frames as one row of numbers each, for a checkpoint."""
     rows = []
     for frame in frames:
         gain = -1.0 if frame.skew_gain is None else frame.skew_gain
@@ -311,7 +312,7 @@ def packed(frames: Iterable[FrameFormation]) -> NDArray[np.float64]:
 
 
 def unpacked(numbers: NDArray[np.float64]) -> Iterator[FrameFormation]:
-    """Yield the frames of which `packed` gave these numbers."""
+    """Yield the frames in the result of `packed`."""
     names = tuple(as_row(FrameFormation(0)))
     for row in (dict(zip(names, values, strict=True)) for values in numbers.tolist()):
         gain = None if row["skew_gain"] < 0.0 else row["skew_gain"]

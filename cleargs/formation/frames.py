@@ -1,4 +1,4 @@
-"""The frames of a capture as views: what a scene is trained on and compared with."""
+"""The frames of a capture as the views that a scene is trained on and compared with."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from cleargs.splat.views import TrainingView
 from cleargs.types import AnyImage, MaskBool
 
 GIVEN = "given"
-"""Value of ``placed`` in ``ingest/frames.parquet`` of a pose of the input that fits the images: features miss
-their points by no more than ``ingest.refine_above`` (median). Ingest adjusts other poses or finds them."""
+"""Value of ``placed`` in ``ingest/frames.parquet`` for a pose that is unchanged from the input: features miss
+their points by at most ``ingest.refine_above`` px (median). Ingest adjusts or estimates all other poses."""
 
 
 def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
@@ -58,7 +58,7 @@ def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Pa
 
 
 def seen_points(points: Points, ingest: Path, views: Sequence[TrainingView]) -> SparsePoints:
-    """Return all ``points``, and which of them each view observes by the tables in ``ingest``."""
+    """Return all ``points``, and the rows of those that each view observes, from the folder ``ingest``."""
     frame_id, point_id = load_observations(ingest)
     order = np.argsort(points.point_id)
     rows = order[np.searchsorted(points.point_id, point_id, sorter=order)]

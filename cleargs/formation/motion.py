@@ -1,4 +1,4 @@
-"""The numbers of a frame's formation: motion and focus of the camera while it took the frame."""
+"""Parameters of a frame's image formation: motion and focus of the camera while it took the frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cleargs.splat.camera import Camera
 from cleargs.types import ArrayF32, ArrayF64
 
 TWIST = 6
-"""Numbers of a twist: translation by x, y, z, then rotation about them, in camera axes."""
+"""Number of values of a twist: translation along x, y, z, then rotation about x, y, z, in camera axes."""
 
 TWISTS = ("pose", "blur", "skew", "bend", "cube")
 """Names of a motion's twists, in the order of its numbers."""
@@ -38,15 +38,15 @@ class FrameMotion:
 
     At time t of a row's exposure, from -1/2 to 1/2, the scene has moved by
     pose + t blur + (t^2 - 1/12) bend + (t^3 - 3t/20) cube. The polynomials are orthogonal, so that a
-    higher order leaves the mean pose and the lower orders as they are.
+    higher order does not change the mean pose and the lower orders.
     """
 
     blur: ArrayF64 = field(default_factory=_still)
-    """From the start to the end of a row's exposure, by the part of the path that is linear in time."""
+    """Motion from the start to the end of a row's exposure: the part of the path that is linear in time."""
     skew: ArrayF64 = field(default_factory=_still)
-    """From the first to the last row's exposure: the rolling shutter. The middle row has the frame's pose."""
+    """Motion from the first to the last row's exposure (rolling shutter); 0 at the middle row."""
     pose: ArrayF64 = field(default_factory=_still)
-    """From the frame's pose as given to the mean pose of its exposure."""
+    """Motion from the given pose of the frame to the mean pose of its exposure."""
     bend: ArrayF64 = field(default_factory=_still)
     cube: ArrayF64 = field(default_factory=_still)
     disc_px: float = 0.0
@@ -61,7 +61,7 @@ class FrameMotion:
         return np.concatenate([getattr(self, name) for name in TWISTS])
 
     def with_vector(self, vector: ArrayF64) -> FrameMotion:
-        """Return this motion with the twists of another `vector`."""
+        """Return this motion with the twists in ``vector`` [30], in the order of `vector`."""
         pose, blur, skew, bend, cube = vector.reshape(len(TWISTS), TWIST)
         return replace(self, pose=pose, blur=blur, skew=skew, bend=bend, cube=cube)
 
@@ -90,9 +90,9 @@ def flow_basis(
 ) -> ArrayF32:
     """Return the displacement of every pixel under each component of a twist, [6, 2, H, W] pixels per unit.
 
-    The twist is of the scene past the camera. A displacement leads to the place in the still image that the
-    pixel sees. It is the flow that the same motion of the camera gives. The camera may be larger than
-    ``nearness``, in proportion.
+    The twist is the motion of the scene past the camera. A displacement points from a pixel to the place in
+    the still image that it shows. It equals the optical flow of the same motion of the camera. Pixels are
+    those of ``nearness``. The image of ``camera`` may be larger, in proportion.
     Source: Longuet-Higgins & Prazdny, "The interpretation of a moving retinal image" (1980).
     """
     height, width = nearness.shape
@@ -111,7 +111,7 @@ def flow_basis(
 
 
 def grid_basis(camera: Camera, shape: tuple[int, int]) -> ArrayF64:
-    """Return `flow_basis` at the median depth and the centres of a grid, [6, 2, rows, columns] px."""
+    """Return `flow_basis` at the median depth and the centres of a grid, [6, 2, rows, columns] camera px."""
     basis = flow_basis(camera, np.ones(shape, np.float32)).astype(np.float64)
     basis *= np.array([camera.width / shape[1], camera.height / shape[0]])[:, None, None]
     return basis
@@ -122,8 +122,8 @@ def pixel_paths(
 ) -> ArrayF64:  # [T, rows, columns, 2] px
     """Return the displacements of the pixels at the centres of a grid at ``times`` of the exposure.
 
-    They are those at the median depth, relative to the mean of the exposure. ``shape`` are rows and columns
-    of the grid. Times are from -1/2 to 1/2.
+    They are those at the median depth, relative to the mean over the exposure. ``shape`` is the numbers of
+    rows and columns of the grid. Times are from -1/2 to 1/2.
     """
     basis = grid_basis(camera, shape)
     orders = np.stack([times, times**2 - 1 / 12, times**3 - 3 * times / 20])

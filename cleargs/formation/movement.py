@@ -1,15 +1,15 @@
 """Movement in a capture: regions of a frame that the scene of the other frames does not explain.
 
-Each frame has a grid of cells. A cell moves if all of the following holds:
+Each frame has a grid of cells. A cell moves if all of the following are true:
 
 - Its mean colour differs from that of the render as the frame's camera saw it. Detail that is missing, or a
   little out of place, cancels out over a cell.
 - The difference exceeds five times the median of the frame, so that nothing moves in a frame that differs
   everywhere, as with an unknown exposure.
-- At least three other frames see the same place of the scene, and at most half of them differ there by half
-  as much. A place that most frames show like this does not move, and a place that others do not see has no
-  witness.
-- It belongs to a region of several cells.
+- At least three other frames see the same place of the scene, and the median of their differences there is
+  below a fifth of the cell's difference. Content that most frames show at a place does not move.
+- The place moves in at most half of the eight nearest frames that see it.
+- It belongs to a region of at least six cells.
 
 Sources: Sabour et al., "RobustNeRF" (2023), for the trimmed residual on neighbourhoods; the comparison with
 the other frames at the same place is ours.
@@ -35,23 +35,23 @@ from cleargs.types import ArrayF32, ArrayF64, MaskBool
 TOLERANCE = 0.1
 """Difference of mean colours, sRGB in [0, 1], up to which nothing moves."""
 HIDING = 0.3
-"""Ghosting of a frame, by RVA, from which movement is looked for (docs/movement.md)."""
+"""RVA's ghosting cue of a frame from which the training looks for movement (docs/movement.md)."""
 CELLS = 32
 """Cells along the longer side of a frame."""
 MEDIAN_FACTOR = 5.0
 """Multiple of the frame's median difference up to which a difference is ordinary."""
 OTHERS_FACTOR = 0.2
-"""Part of a cell's difference up to which the median of the other frames, at the same place, contradicts."""
+"""A cell can move if the median difference of the other frames is below this share of its difference."""
 MIN_OTHERS = 3
 """Fewest other frames that see a place where something can move."""
 NEAR_FRAMES, MAX_NEAR_SHARE = 8, 0.5
-"""Number of the other frames with the nearest cameras, and the largest share of them in which the same place
-may move. If it moves in more of them, something that does not move has been left out by mistake: the masks
-keep it from being learned, and then it differs."""
+"""Number of nearest frames, by camera, that see a place, and the largest share of them in which it may move.
+If it moves in more, something that does not move was masked by mistake. It was then not learned, so it
+differs from the render."""
 MIN_CELLS = 6
 """Fewest cells of a region that moves."""
 EVERY = 3
-"""Steps on a frame between two looks at what moves in it."""
+"""Steps on a frame between two looks (comparisons that update the cells that move)."""
 START = 0.25
 """Share of the schedule from which movement is looked for."""
 
@@ -64,7 +64,7 @@ MOVEMENT = pa.schema(
         column("moves", pa.binary(), "a bit per cell, row by row, the first is the highest; 1: it moves"),
     ]
 )
-"""``movement.parquet``: the masks that a training used at its end. Other frames count whole."""
+"""``movement.parquet``: the masks that a training used at its end. In other frames nothing moves."""
 
 
 class Movement:
@@ -94,11 +94,11 @@ class Movement:
         ).reshape(-1, 4)
 
     def due(self, draws: int, progress: float) -> bool:
-        """Return True if a step on a frame, with ``draws`` steps before it, takes a look."""
+        """Return True if a step on a frame, after ``draws`` earlier ones, includes a look."""
         return self._tolerance > 0.0 and progress >= START and draws % EVERY == 0
 
     def masks(self) -> dict[int, MaskBool]:
-        """Return the cells that move [rows, columns], of the frames in which some do."""
+        """Return the cells that move [rows, columns], by frame_id, for frames in which something moves."""
         return {frame_id: self._moves[k] for frame_id, k in self._place.items() if self._moves[k].any()}
 
     def look(
@@ -110,7 +110,7 @@ class Movement:
         target: Tensor,  # [H, W, 3] sRGB
         mask: Tensor | None,  # [H, W] pixels that count by the user's mask
     ) -> None:
-        """Compare a frame, ``target``, with the scene, and find again what moves in it."""
+        """Compare a frame, ``target``, with the scene, and update the cells that move in it."""
         k, (height, width) = self._place[frame_id], image.shape[:2]
         assert render.depth is not None
         inner = slice(margin, margin + height), slice(margin, margin + width)
@@ -163,11 +163,11 @@ class Movement:
     def _elsewhere(
         self, k: int, row: NDArray[np.intp], column: NDArray[np.intp], depth: ArrayF32
     ) -> tuple[ArrayF32, NDArray[np.int64], ArrayF64]:
-        """Return what the other frames say of the places that C cells of frame ``k`` show at ``depth``.
+        """Return the differences of other frames at the places that C cells of frame ``k`` show at ``depth``.
 
-        These are the median [C] of their differences, infinite where no other frame sees the place; the
-        number of frames [C] that see it and have been looked at; and the share [C] of the `NEAR_FRAMES` of
-        these with the nearest cameras, in which it moves.
+        These are three arrays [C]: the median of the differences, infinite if no other frame sees the place;
+        the number of frames that see it and had a look; and the share of the `NEAR_FRAMES` of these with the
+        nearest cameras in which it moves.
         """
         rows, columns = self._moves.shape[1:]
         fx, fy, cx, cy = self._lenses[k]
@@ -197,7 +197,7 @@ class Movement:
 
 
 def regions(cells: MaskBool) -> MaskBool:  # [rows, columns]
-    """Return the cells of regions of at least `MIN_CELLS`, closed, with their border of one cell."""
+    """Return the regions of at least `MIN_CELLS` cells, with gaps closed and a border of one cell added."""
     closed = cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= MIN_CELLS
@@ -238,7 +238,7 @@ def write_movement(path: Path, masks: Mapping[int, MaskBool]) -> None:
 def read_movement(path: Path) -> dict[int, MaskBool]:
     """Read ``movement.parquet``: the cells that move [rows, columns], by frame_id.
 
-    Raises StoreError when it is missing or damaged.
+    Raises StoreError if it is missing or damaged.
     """
     found = {}
     for row in read_table(path, MOVEMENT).to_pylist():

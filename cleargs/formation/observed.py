@@ -1,4 +1,4 @@
-"""A render as the camera of a frame saw it, the way back of its gradient, and how well it fits the frame."""
+"""The observed image of a frame (its render after image formation), its gradient, and its PSNR."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from cleargs.types import MaskBool
 
 @dataclass(eq=False)
 class FormedView:
-    """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
+    """Implementation of `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
-    ``look`` gets each photograph with its render and margin, and returns the pixels that count: see
+    ``look`` receives each observed image with its render and margin, and returns the pixels that count: see
     `cleargs.formation.movement`.
     """
 
@@ -54,7 +54,7 @@ class FormedView:
         self.needs_depth = self.formation is not None or self.look is not None
 
     def forward(self, render: Render) -> Tensor:
-        """Return the photograph [H, W, 3] sRGB of a render at ``camera``."""
+        """Return the observed image [H, W, 3] sRGB of a render at ``camera``."""
         image, device = render.image, render.image.device
         backend = backend_for(device)
         if self.affine is not None:
@@ -69,7 +69,7 @@ class FormedView:
         return image
 
     def warp(self, render: Render) -> Warp:
-        """Return B of the frame, from a render at ``camera`` with depth."""
+        """Return the operator B of the frame (`Warp`), from a render at ``camera`` with depth."""
         assert self.formation is not None and render.depth is not None
         fields = displacement_fields(
             self.formation.motion, self._frame_camera, render.depth, render.alpha, self._margin, self.factor
@@ -77,7 +77,7 @@ class FormedView:
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Return the gradient by the render's image, from that by the photograph."""
+        """Return the gradient by the render's image, from that by the observed image."""
         backend = backend_for(gradient.device)
         if self.formation is not None:
             light = backend.times_slope(gradient, self._to_srgb, CHANNELS)
@@ -102,7 +102,7 @@ def render_observed(
 ) -> Tensor:
     """Render ``scene`` as the camera of a view records it: [H, W, 3] sRGB in [0, 1], in new memory.
 
-    Without ``exposure`` the colours stay as they are. Without ``formation`` the render is sharp. ``engine``
+    Without ``exposure`` the colours do not change. Without ``formation`` the render is sharp. ``engine``
     is a rasteriser of the scene's device.
     """
     engine = engine or rasteriser_for(str(scene.gaussians.device))
@@ -114,7 +114,7 @@ def render_observed(
 
 
 MAX_EVALUATED = 32
-"""Most frames, evenly over the capture, on which a stage compares its scene with the photographs."""
+"""Maximum number of frames, evenly spread, on which a stage compares its scene with the photographs."""
 
 
 class Fit(NamedTuple):
@@ -122,13 +122,13 @@ class Fit(NamedTuple):
 
     psnr: float
     unseen: float | None
-    """PSNR over those that are `unseen_pixels`; None where there are none."""
+    """PSNR over the `unseen_pixels` that count, dB; None if there are none."""
 
 
 def pooled_unseen(fits: Iterable[Fit]) -> float | None:
-    """Return the PSNR, dB, of the pixels that no training saw, of all views; None where there are none.
+    """Return the PSNR, dB, over the pixels of all views that no training saw; None if there are none.
 
-    Errors are averaged and not PSNRs, since some views have so little texture there that they would dominate.
+    Errors are averaged, not PSNRs: views with little texture in these pixels would dominate a mean of PSNRs.
     """
     errors = [10.0 ** (-0.1 * fit.unseen) for fit in fits if fit.unseen is not None]
     error = math.fsum(errors) / len(errors) if errors else 0.0
@@ -144,7 +144,7 @@ def evaluate_views(
     moving: Mapping[int, MaskBool] | None = None,
     engine: Rasteriser | None = None,
 ) -> list[Fit]:
-    """Compare the scene with every view as photographed, in their order, at full size.
+    """Compare the observed image of the scene with every view, in their order, at full size.
 
     Pixels of the cells ``moving``, by frame_id, do not count (see `cleargs.formation.movement`).
     """

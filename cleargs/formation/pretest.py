@@ -1,12 +1,13 @@
-"""A test of a few milliseconds that says if a photograph is blurrier than a render, and along which way.
+"""Test in a few milliseconds if a photograph has blur that a render does not have, and in which direction.
 
 For a small blur of covariance S the photograph is
 
     offset + gain * render + shift . grad(render) + tr(S H(render)) / 2
 
-where H is the Hessian of the render. These are seven numbers by least squares. They are fitted on the tiles
-of one colour of a checkerboard and judged on the tiles of the other colour, and the reverse. Both images are
-smoothed first, so that a blur is small against the detail that is left: one fit per size of a pyramid.
+where H is the Hessian of the render. These seven numbers are fitted by least squares on the tiles of one
+colour of a checkerboard. The error is measured on the *unseen* tiles of the other colour, and vice versa.
+Both images are smoothed first, so that a blur is small compared with the remaining detail. One fit is made
+for each size of an image pyramid.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ SMALLEST = 24
 SIGMA = 1.0
 """Standard deviation of the Gaussian that smooths both images at every size, px."""
 STRIDE = 2
-"""Rows and columns from one pixel that is read to the next."""
+"""Distance of the rows and columns that are read, px."""
 TILE = 32
-"""Side of a tile at the largest size, px. It stays the same part of the image at smaller sizes."""
+"""Side of a tile at the largest size, px. A tile covers the same part of the image at smaller sizes."""
 MIN_TILE = 4
 
 MIN_VARIANCE = 0.05
 """Variance below which a blur does not count as evidence, px^2: that of a sweep of 0.8 px."""
 
 _STILL, _ALL = 4, 7
-"""Numbers of the fit without a blur, and of the whole fit."""
+"""Number of parameters without a blur, and of all parameters."""
 _RIDGE = 1e-9
 
 
@@ -52,22 +53,22 @@ class BlurEvidence:
     """Variance of that blur, px^2: L^2 / 12 for a straight sweep of length L. Negative where the render is
     blurrier than the photograph."""
     angle: float
-    """Its direction, radians from the x axis towards the y axis."""
+    """Direction of that blur, radians from the x axis towards the y axis."""
     disc_gain: float
-    """Share that a blur removes that is equal in all directions."""
+    """Share of the error, as for `line_gain`, that a blur with equal variance in all directions removes."""
     disc: float
-    """Variance of that blur along any direction, px^2: R^2 / 4 for a disc of radius R."""
+    """Variance of that second blur along any direction, px^2: R^2 / 4 for a disc of radius R."""
 
     @property
     def gain(self) -> float:
-        """Share of the better of the two; 0 where neither blurs by as much as `MIN_VARIANCE`."""
+        """The larger share, among the blurs with a variance above `MIN_VARIANCE`; 0 if there are none."""
         line = self.line_gain if self.line > MIN_VARIANCE else 0.0
         disc = self.disc_gain if self.disc > MIN_VARIANCE else 0.0
         return max(line, disc, 0.0)
 
     @property
     def length(self) -> float:
-        """Length of a straight sweep with the variance of the line, px."""
+        """Length of a straight sweep with the variance `line`, px."""
         return math.sqrt(12.0 * max(self.line, 0.0))
 
 
@@ -79,7 +80,7 @@ def blur_evidence(
     observed: PlaneF32,  # [H, W] likewise
     weight: PlaneF32,  # [H, W] 0 where a pixel does not count
 ) -> BlurEvidence:
-    """Return the evidence at the size of the pyramid where a blur explains most."""
+    """Return the evidence at the size of the pyramid at which a blur explains most."""
     height, width = observed.shape
     scale = min(1.0, LARGEST / max(height, width))
     best = NO_EVIDENCE

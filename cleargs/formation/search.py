@@ -26,27 +26,27 @@ from cleargs.formation.motion import BEND, BLUR, CUBE, POSE, SKEW, TWIST, TWISTS
 from cleargs.types import ArrayF64
 
 WARM_STEPS = 2
-"""Gauss-Newton steps of a fit that starts from the last one."""
+"""Number of Gauss-Newton steps of a fit that starts from the previous one."""
 
 LENGTHS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 DIRECTIONS = 8
-"""The blurs that a search without a start begins with, in pixels of the coarsest level. A descent only goes
-downhill, and a long blur may be behind a hill."""
+"""Lengths, in pixels of the coarsest level, and number of directions of the blurs that a search without a
+start begins with. From no motion, a descent may end in a local minimum and miss a long blur."""
 STARTS = 3
-"""Number of the best of them that are followed, in addition to no motion."""
+"""Number of the best of these blurs from which a descent starts. Others start from a short blur and none."""
 
 RADII = (1.0, 2.0, 3.0, 4.5, 7.0)
 """Mean radii of the discs that a search for defocus begins with, in pixels of the coarsest level."""
 NARROWING = (0.25, 0.12, 0.06)
-"""Steps of its pattern search, as shares of the radius and of the range of nearness."""
+"""Steps of the pattern search for a disc, as shares of its radius and of the range of nearness."""
 
 MODEL_PENALTY = 0.005
 """Share of the misfit that each further motion must explain to be preferred to a simpler model."""
 
 DAMPING, MORE_DAMPING = 1e-2, 6.0
 DAMPING_FLOOR = 1e-4
-"""Damping of every direction, as a share of the stiffest: a number that the image does not show stays near
-zero."""
+"""Further damping of every parameter, as a share of the largest element of the diagonal. A parameter that the
+image does not determine changes little."""
 CONVERGED = 1e-3
 MAX_TRIES = 4
 
@@ -56,8 +56,8 @@ ORDER_PENALTY = 0.005
 """Share of the misfit without any motion that each further order of the path must explain to be preferred."""
 
 BEND_SHARE = 0.01
-"""Share of the difference that a path must explain at a size before a cubic one is tried there. Most frames
-are sharp, and a cubic path has four times the unknowns of a straight one."""
+"""Share of the difference that a path must explain at a size before a cubic path is tried at that size. Most
+frames are sharp, and a cubic path has four times the unknowns of a straight one."""
 
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
@@ -66,14 +66,15 @@ _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus
 def search(
     pair: FramePair,
     *,
-    start: FrameMotion | None = None,  # has the blur to begin with; None: the best of a grid of blurs
+    start: FrameMotion | None = None,  # motion with the blur to begin with; None: the best of a grid of blurs
     skew: bool = True,  # try models with a rolling shutter, which doubles the time
     defocus: bool = True,  # try a disc of defocus, which doubles the time
     pose: bool = False,  # correct the pose together with each motion
 ) -> list[MotionFit]:
     """Fit every model from scratch.
 
-    Return the fit of ``none`` first, then one of each model, those with a blur by the order of the path.
+    Return the fit of ``none`` first, then those of each model. Models with a blur have one per order of the
+    path that was tried.
     """
     levels = [Level(pair, scale) for scale in scales(pair)]
     coarse = levels[0]
@@ -107,10 +108,10 @@ def search(
 def refine(
     pair: FramePair, model: Model, motion: FrameMotion, *, pose: bool = False, curve: bool = False
 ) -> list[MotionFit]:
-    """Fit ``model`` again from the numbers of the last fit, at the finest level.
+    """Fit ``model`` again at the finest level, from the ``motion`` of the last fit.
 
-    The pose is corrected with ``pose``, and the next order of the path is tried with ``curve``. Return the
-    fit of ``none`` first, then that of ``model`` where it is another, then that of the next order.
+    ``pose`` corrects the pose too, and ``curve`` tries the next order of the path. Return the fit of ``none``
+    first, then that of ``model`` if it is not ``none``, then that of the next order if it was tried.
     """
     level = finest_level(pair)
     if model == "none":
@@ -128,10 +129,7 @@ def refine(
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
-    """Return the fit with the least misfit on the held-out pixels.
-
-    Each further motion has a price, and each further order of the path.
-    """
+    """Return the fit with the least misfit, with penalties for further motions and orders of the path."""
 
     def cost(fit: MotionFit) -> float:
         model = fit.misfit * (1.0 + MODEL_PENALTY * _PARTS[fit.model])
@@ -141,7 +139,7 @@ def preferred(found: list[MotionFit]) -> MotionFit:
 
 
 def _promising(level: Level, paths: list[FrameMotion], still: FrameMotion) -> FrameMotion | None:
-    """Return the best of ``paths``; None if it explains too little here for a cubic path to be tried."""
+    """Return the best of ``paths``; None if it explains less than `BEND_SHARE` at this size."""
     costs = [level.cost(path) for path in paths]
     enough = min(costs) < (1.0 - BEND_SHARE) * level.cost(still)
     return paths[costs.index(min(costs))] if enough else None
@@ -159,8 +157,8 @@ def _best(
 ) -> FrameMotion:
     """Return the best end of the descents from ``starts`` with a path of ``order``.
 
-    A pose that is not corrected is that at the middle of the exposure. If the path bends, the mean pose is
-    a twelfth of the bend away from it.
+    If the pose is not corrected, the given pose is that at the middle of the exposure. On a curved path, the
+    mean pose is then a twelfth of the bend away from it.
     """
     bends = order > 1
     parts = [*([POSE] if pose or bends else []), *_ACTIVE[model], *((BEND, CUBE)[: order - 1])]
@@ -175,7 +173,7 @@ def _best(
 
 
 def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
-    """Return the best of a grid of rotations about the axes across the view, and no motion."""
+    """Return the best of a grid of rotations about the camera's x and y axes, a short blur and no motion."""
     pixel = 1.0 / level.scale
     motions = [
         replace(still, blur=_rotation(length * pixel, math.pi * k / DIRECTIONS))
@@ -196,7 +194,7 @@ def _near(level: Level, still: FrameMotion, start: FrameMotion) -> list[FrameMot
 def _short(level: Level, motion: FrameMotion) -> FrameMotion:
     """Return a short blur along that of ``motion``.
 
-    Without any blur the slope by the blur vanishes, and a descent would stay there.
+    If the blur is 0, the derivative by the blur is 0, and a descent would not move.
     """
     length = float(np.linalg.norm(motion.blur))
     blur = motion.blur / length if length > 0.0 else _rotation(1.0, 0.0)
@@ -245,7 +243,7 @@ def _descend(
             matrix, side = unknowns.T @ matrix @ unknowns, unknowns.T @ side
         diagonal = matrix.diagonal()
         if diagonal.max() <= 0.0:
-            break  # nothing to see
+            break  # the image determines none of the numbers
         for _ in range(MAX_TRIES):
             damped = matrix + np.diag(damping * diagonal + DAMPING_FLOOR * diagonal.max())
             trial = vector.copy()
@@ -265,7 +263,7 @@ def _descend(
 
 
 def blur_along(length: float, angle: float) -> FrameMotion:
-    """Return a straight blur of ``length`` px by turns of the camera; ``angle`` is from x towards y."""
+    """Return a straight blur of ``length`` px by a rotation; ``angle`` is in radians from x towards y."""
     return FrameMotion(blur=_rotation(length, math.pi - angle))
 
 

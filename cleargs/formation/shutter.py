@@ -1,10 +1,10 @@
-"""A rolling shutter: whether a capture has one, and the skew that all its frames have in common.
+"""Detection of a rolling shutter in a capture, and the skew that all its frames have in common.
 
-A scene can take up a skew that all frames share: a walk around a table with a rolling shutter looks like one
-with a still shutter around a table that is twisted about its axis. The poses tell the two apart. The readout
+A scene can absorb a skew that all frames share: a walk around a table with a rolling shutter looks like one
+with a still shutter around a table that is twisted about its axis. The poses distinguish the two. The readout
 takes the same time in every frame, so a frame's skew is that time multiplied by the speed of the camera at
-the frame, plus the hand's tremor. From frame to frame both vary, and the slope of the one over the other is
-the readout time. It gives the mean skew from the mean speed.
+the frame, plus the hand's tremor. Skew and speed vary from frame to frame. The slope of the skew over the
+speed is the readout time. The mean skew is the readout time multiplied by the mean speed.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
 MIN_TIMED_FRAMES, UNEVEN = 8, 2.0
-"""Fewest frames with a speed that tell the readout time, and the factor from the median gap between frames to
-the shortest and the longest one at a frame with a speed. In a shorter gap an error of a pose weighs more."""
+"""Fewest frames with a speed from which the readout time is estimated. A frame has a speed if the gaps around
+it differ from the median gap by at most this factor: in a short gap, a pose error has more effect."""
 MIN_CORRELATION = 0.4
 """Least correlation of skews and speeds from which the slope gives the readout time. Source: measurements in
 docs/experiments/formation.md."""
@@ -63,13 +63,13 @@ class CameraSpeeds:
     """Twist [6] per unit of time, by frame_id: translation in world units and rotation in radians, both times
     the focal length in px. It is that of a cubic spline through the poses."""
     metric: ArrayF64  # [6, 6]
-    """Matrix of the squared image motion of a twist in px, its mean over the image."""
+    """Matrix M: the mean squared image motion of a twist v in px over the image is vᵀ M v, px^2."""
     interval: float
     """Median time between frames. No readout takes longer."""
 
     @classmethod
     def of(cls, views: Sequence[TrainingView]) -> CameraSpeeds | None:
-        """Return the speeds in the ``views``, by frame_id; None where times or poses do not give them."""
+        """Return the speeds in ``views``; None if there are too few views or their times do not increase."""
         times = np.array([view.time for view in views], np.float64)
         gaps = np.diff(times)
         if len(views) < MIN_TIMED_FRAMES + 2 or not (gaps > 0.0).all():
@@ -86,9 +86,9 @@ class CameraSpeeds:
         return cls(per_frame, _image_motion(views[0].camera), interval)
 
     def missing_skew(self, frames: Mapping[int, FrameFormation]) -> ArrayF64 | None:
-        """Return what the skews of all ``frames`` lack in common, a twist [6] as in `per_frame`.
+        """Return the skew that all ``frames`` lack in common, a twist [6] as in `per_frame`.
 
-        None where the skews do not follow the speeds, or the speeds vary too little to tell.
+        None if there are too few frames, skews and speeds do not correlate, or the readout is too long.
         """
         ids = [k for k in self.per_frame if frames[k].model in WITH_SKEW]
         if len(ids) < MIN_TIMED_FRAMES:

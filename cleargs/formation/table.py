@@ -1,4 +1,4 @@
-"""``formation.parquet``: how each frame was taken, as a training found it."""
+"""``formation.parquet``: the image formation of each frame, as a training estimated it."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ FORMATION = pa.schema(
 
 
 def write_formation(path: Path, formation: CaptureFormation, weights: Mapping[int, float]) -> None:
-    """Write ``formation.parquet``; ``weights``: of the raw frames, as RVA gave them."""
+    """Write ``formation.parquet``. ``weights`` are RVA's weights of the raw frames, by frame_id."""
     rows = [
         as_row(frame)
         | {
@@ -80,9 +80,9 @@ def write_formation(path: Path, formation: CaptureFormation, weights: Mapping[in
 
 
 def read_formation(path: Path) -> tuple[dict[int, FrameFormation], dict[int, float]]:
-    """Read ``formation.parquet``: what was found, and the weights at the end, by frame_id.
+    """Read ``formation.parquet``: the formations, and the weights at the end, by frame_id.
 
-    Raises StoreError when it is missing or damaged.
+    Raises StoreError if it is missing or damaged.
     """
     rows = read_table(path, FORMATION).to_pylist()
     weights = {row["frame_id"]: row["weight_after"] for row in rows}

@@ -19,27 +19,27 @@ from cleargs.splat.kernels.warp_layout import CUBE_REACH, DisplacementFields
 from cleargs.types import ArrayF32, ArrayF64
 
 SAMPLES_PER_PIXEL = 1.0
-"""Samples per pixel of a blur's length. With 0.7 scenes end less sharp (up to 0.2 dB, a tenth more LPIPS),
-with 1.5 no sharper: docs/experiments/formation.md."""
+"""Samples per pixel of a blur's length. With 0.7 scenes are less sharp (up to 0.2 dB, a tenth more LPIPS),
+with 1.5 they are not sharper (docs/experiments/formation.md)."""
 SAMPLES_PER_DISC_PIXEL = 0.8
 """Samples per pixel of a disc's area."""
 MIN_SAMPLES, MAX_SAMPLES = 3, 64
 MIN_DIVIDED = 8
-"""Number of samples from which a blur is taken in two passes. Scenes end alike, and a step with a blur of
-30 px costs four fifths as much (docs/experiments/formation.md)."""
+"""Number of samples from which a blur is computed in two passes. Scenes are as good, and a step with a blur
+of 30 px takes four fifths of the time (docs/experiments/formation.md)."""
 MAX_BOW = 0.5
-"""Largest distance, px, of a part of a curved path from the mean path of all parts that replaces it in the
+"""Largest distance, px, between a part of a curved path and the mean of all parts, which replaces it in the
 second pass."""
 STEPS_APART = 4
-"""Samples of neighbouring times write to the same pixels in the transpose. One that follows at once waits for
-the other; four steps later it does not: along a row that takes half of the transpose's time, down a column
-as much as before."""
+"""Time steps between one sample and the next. In the transpose, samples of neighbouring times write to the
+same pixels, and a write that follows at once waits for the one before. This order halves the time of the
+transpose for a blur along a row, and does not change it for one along a column."""
 
 STRIDE = 8
-"""Rows and columns from one pixel to the next whose displacements set the number of samples."""
+"""Distance of the rows and columns whose displacements set the number of samples, px."""
 
 SPEEDS = 8
-"""Times at which the speed on a curved path is taken to measure its length."""
+"""Number of times at which the speed on a curved path is evaluated to measure its length."""
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PLASTIC = 0.7548776662466927
@@ -49,7 +49,7 @@ _PLASTIC = 0.7548776662466927
 def enough_samples(fields: DisplacementFields) -> tuple[int, int]:
     """Return the numbers of sample times and of points of the disc that are about a pixel apart.
 
-    A number is 1 where the frame has no such blur, and at most `MAX_SAMPLES`.
+    A number is 1 if the frame has no such blur, and at most `MAX_SAMPLES`.
     """
     longest = float(np.quantile(path_lengths(fields, STRIDE), 0.95))
     widest = float(np.quantile(fields.radius[::STRIDE, ::STRIDE].cpu().numpy(), 0.95))
@@ -78,7 +78,7 @@ def samples(count: int) -> ArrayF32:
     """Return ``count`` sample times and points of the disc: [count, 3] t, u, v.
 
     The times are the middles of equal parts of an exposure, from -1/2 to 1/2, in the order of `STEPS_APART`.
-    The points are a sunflower's, in an order that does not depend on time, with their centre at the disc's.
+    The points form a sunflower pattern around the centre of the disc. Their order does not follow the times.
     """
     if count == 1:
         return np.zeros((1, 3), np.float32)
@@ -96,8 +96,8 @@ def displacement_fields(
 ) -> DisplacementFields:
     """Return the displacement fields of a frame with ``camera``.
 
-    Accumulated depth and alpha are of a render at the frame's pose, larger than the frame by ``margin``
-    pixels on every side. The frame is ``scale`` times as large as that in whose pixels ``motion`` is.
+    Accumulated depth and alpha are from a render at the frame's pose, larger than the frame by ``margin``
+    pixels on every side. ``motion`` is in pixels of a frame that is 1 / ``scale`` times as large.
     """
     numbers = np.empty(layout.MOTION_COLUMNS, np.float32)
     numbers[[layout.FX, layout.FY, layout.CX, layout.CY]] = camera.fx, camera.fy, camera.cx, camera.cy
@@ -111,9 +111,9 @@ def displacement_fields(
 class Warp:
     """B for one frame. The image is larger than the photograph by ``margin`` pixels on every side.
 
-    A long blur is taken in two passes: samples some pixels apart, then the mean over the path from one to
-    the next (``between``), so that 30 samples cost 6 + 5. The result is the same if all pixels are blurred
-    alike. If neighbours are not, the second pass, a few pixels long, treats them as alike.
+    A long blur is computed in two passes: samples some pixels apart, then the mean over the path from one to
+    the next (``between``). So 30 samples cost 6 + 5. The result is the same if all pixels have equal blur.
+    Otherwise the second pass, a few pixels long, treats neighbouring pixels as if they had.
     """
 
     fields: DisplacementFields
@@ -147,7 +147,7 @@ class Warp:
 
 
 def _straight_parts(fields: DisplacementFields) -> int:
-    """Return the number of equal parts of the exposure whose paths differ by `MAX_BOW` at most."""
+    """Return the number of equal parts of the exposure whose paths differ by at most `MAX_BOW`."""
     if fields.curve is None:
         return 1
     bend, cube = np.split(fields.curve[:, ::STRIDE, ::STRIDE].cpu().numpy(), 2)

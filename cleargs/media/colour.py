@@ -27,25 +27,25 @@ HLG_PEAK = 1000.0
 """Nominal peak of the HLG display, cd/m² (ITU-R BT.2100: system gamma 1.2)."""
 
 KNEE = 0.6
-"""Linear value from which `tone_map` bends highlights."""
+"""Linear value from which `tone_map` compresses highlights."""
 
 
 def linear_from_srgb(srgb: NDArray[F]) -> NDArray[F]:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1). Values below 0 continue the linear part."""
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1). The linear part also holds below 0."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4).astype(
         srgb.dtype
     )
 
 
 def srgb_from_linear(linear: NDArray[F]) -> NDArray[F]:
-    """Linear light in [0, 1] to sRGB (IEC 61966-2-1). Values below 0 continue the linear part."""
+    """Convert linear light in [0, 1] to sRGB (IEC 61966-2-1). The linear part also holds below 0."""
     return np.where(
         linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0) ** (1 / 2.4) - 0.055
     ).astype(linear.dtype)
 
 
 def rgb_from_yuv(yuv: NDArray[F], matrix: str, bits: int, *, full_range: bool) -> NDArray[F]:  # [3, H, W]
-    """Y'CbCr code values of ``bits`` bits to R'G'B' [H, W, 3], nominally in [0, 1] and not clipped.
+    """Convert Y'CbCr code values of ``bits`` bits to R'G'B' [H, W, 3], nominally in [0, 1] and not clipped.
 
     ``matrix`` is a key of `LUMA`. Limited range: Y 16..235, chroma 16..240 (times 2^(bits - 8)).
     """
@@ -61,7 +61,7 @@ def rgb_from_yuv(yuv: NDArray[F], matrix: str, bits: int, *, full_range: bool) -
 
 
 def light_from_pq(signal: NDArray[F]) -> NDArray[F]:
-    """PQ code values in [0, 1] to display light, reference white = 1 (SMPTE ST 2084 EOTF)."""
+    """Convert PQ code values in [0, 1] to display light, reference white = 1 (SMPTE ST 2084 EOTF)."""
     m1, m2 = 2610 / 16384, 2523 / 4096 * 128
     c1, c2, c3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
     power = np.clip(signal, 0, 1) ** (1 / m2)
@@ -70,7 +70,7 @@ def light_from_pq(signal: NDArray[F]) -> NDArray[F]:
 
 
 def light_from_hlg(signal: NDArray[F]) -> NDArray[F]:  # [H, W, 3]
-    """HLG R'G'B' in [0, 1] (BT.2020 primaries) to display light, reference white = 1 (ITU-R BT.2100)."""
+    """Convert HLG R'G'B' in [0, 1] (BT.2020) to display light, reference white = 1 (ITU-R BT.2100)."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     signal = np.clip(signal, 0, 1)
     scene = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
@@ -83,9 +83,9 @@ def light_from_hlg(signal: NDArray[F]) -> NDArray[F]:  # [H, W, 3]
 def tone_map(light: NDArray[F]) -> NDArray[F]:  # [H, W, 3]
     """Compress unbounded linear light to [0, 1).
 
-    It is the identity up to `KNEE`. Above, it is the shoulder ``knee + (1 - knee) u / (1 + u)`` with
-    ``u = (x - knee) / (1 - knee)``, which has slope 1 at the knee. x is the largest channel; all three are
-    scaled by one factor, so that hues stay.
+    The curve is the identity up to `KNEE`. Above, it is the shoulder ``knee + (1 - knee) u / (1 + u)`` with
+    ``u = (x - knee) / (1 - knee)``, which has slope 1 at the knee. x is the largest channel. All three
+    channels are scaled by one factor, so that the hue does not change.
     """
     peak = light.max(axis=-1, keepdims=True)
     u = np.maximum(peak - KNEE, 0) / (1 - KNEE)
@@ -94,7 +94,7 @@ def tone_map(light: NDArray[F]) -> NDArray[F]:  # [H, W, 3]
 
 
 def srgb_from_hdr(signal: NDArray[F], transfer: str) -> NDArray[F]:  # [H, W, 3]
-    """HDR R'G'B' of BT.2020 primaries (``transfer`` is ``pq`` or ``hlg``) to sRGB in [0, 1]."""
+    """Convert HDR R'G'B' of BT.2020 primaries to sRGB in [0, 1]; ``transfer`` is ``pq`` or ``hlg``."""
     light = light_from_pq(signal) if transfer == "pq" else light_from_hlg(signal)
     rec709 = np.maximum(light @ REC709_FROM_REC2020.T, 0).astype(signal.dtype)
     return srgb_from_linear(tone_map(rec709))

@@ -50,9 +50,9 @@ def write_video(
 ) -> None:
     """Write ``frames`` (at least one, read one by one) as an MP4: 4:2:0, BT.709, limited range.
 
-    ``bits_per_pixel`` is kept over each second by one thread, so that equal frames give equal bytes. None: no
-    visible loss. Raises InputError for an odd size or if this PyAV has no such encoder, and StoreError if the
-    disk is full or not writable.
+    ``bits_per_pixel`` is the rate over each second; one thread encodes, so that equal frames give equal
+    bytes. None: constant quality, no visible loss. Raises InputError for an odd size or if this PyAV has no
+    such encoder, and StoreError if the disk is full or not writable.
     """
     encoder, options = _ENCODERS[codec][0], dict(_ENCODERS[codec][1])
     os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints all its settings on stderr
@@ -91,7 +91,7 @@ def write_video(
 def _planar(rgb: ImageU8) -> VideoFrame:
     """Return RGB as 4:4:4 Y'CbCr.
 
-    swscale only reduces the chroma, because its matrix is several levels off.
+    swscale is used only to reduce the chroma: its colour matrix is off by several levels.
     """
     kr, kb = LUMA["bt709"]
     red, green, blue = np.moveaxis(rgb / 255, -1, 0)

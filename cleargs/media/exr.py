@@ -2,7 +2,7 @@
 
 Layer ``render`` is the channels ``render.R``, ``render.G``, ``render.B``. OpenEXR stores channels in
 alphabetical order, so they are found by name. One of the layers may be stored again as the plain channels R,
-G, B, which programs without layers show. Equal layers and attributes give equal bytes: no date is stored.
+G, B for programs that do not support layers. Equal layers and attributes give equal bytes, without a date.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _write(
     spec.attribute("compression", "zip")
     if count > 1:  # depth alone has no colour
         spec.attribute("oiio:ColorSpace", "lin_rec709")
-    spec.attribute("DateTime", "")  # OpenImageIO stamps the present time unless there is one
+    spec.attribute("DateTime", "")  # OpenImageIO writes the present time unless this is set
     for name, value in attributes.items():
         spec.attribute(name, value)
     with atomic_path(path) as temporary:
@@ -136,7 +136,7 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
     with faults_as(StoreError, f"cannot read {path.name}", hint="delete the file and run its stage again"):
         spec, pixels = _read(path, HALF)
         place = {name: k for k, name in enumerate(spec.channelnames)}
-        # The plain channels are one of the layers again.
+        # The plain channels R, G, B are a copy of one of the layers.
         names = dict.fromkeys(name.rpartition(".")[0] for name in place if name not in _CHANNELS)
         layers = {
             name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])

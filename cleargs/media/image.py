@@ -27,11 +27,11 @@ _JXL = (b"\xff\x0a", b"\0\0\0\x0cJXL ")  # first bytes of JPEG XL files (ISO/IEC
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
-_METADATA = 2**18  # bytes at the start of a file in which its metadata are
+_METADATA = 2**18  # bytes at the start of a file that are searched for metadata
 
 _ORIENTATION, _MODEL, _EXIF = 274, 272, 0x8769
 _LENS = (42036, 37386, 41989)
-"""Numbers of EXIF: orientation, camera, its further entries; of these the lens and its focal lengths."""
+"""EXIF tags: orientation, camera model, a table of further tags; in it, the lens and its focal lengths."""
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, Image.DecompressionBombError)
 """Errors that Pillow raises for a file of the wrong form."""
@@ -40,7 +40,7 @@ _HINT = "copy the file again, convert it to JPEG or PNG, or remove it"
 
 
 def lens_name(path: Path) -> tuple[str, ...]:
-    """Return camera, lens and focal lengths by the EXIF of the image in ``path``.
+    """Return camera, lens and focal lengths from the EXIF data of the image in ``path``.
 
     Phones have several lenses whose images are of one size. Empty if the file cannot be read.
     """
@@ -58,7 +58,7 @@ def is_panorama(path: Path) -> bool:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height of the image in ``path`` as it is stored. Raises InputError without one."""
+    """Return stored width and height of the image in ``path``. Raises InputError if it cannot be read."""
     with _opened(path) as image:
         width, height = image.size
         swapped = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) >= 5
@@ -92,7 +92,7 @@ def read_mask(path: Path) -> MaskU8:  # [H, W]
 def read_alpha(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
     """Return the transparency of an image as a mask: 0 if it is more than half transparent, else 255.
 
-    None if it is opaque everywhere. ``upright`` turns it, and errors are raised, as `read_rgb` does.
+    None if it is opaque everywhere. ``upright`` and errors are as in `read_rgb`.
     """
     if path.suffix.lower() in _OPAQUE:
         return None
@@ -160,7 +160,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             if head.startswith(_JXL):
                 yield _jpeg_xl(path)
                 return
-            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # ours is checked before decoding
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # `MAX_PIXELS` is checked later
             try:
                 opened = Image.open(path, formats=["HEIF"] if heic else _FORMATS)
             finally:
@@ -218,7 +218,7 @@ def _register_heic(path: Path) -> None:
 
 
 def _grey(image: Image.Image) -> Image.Image:
-    """Return the image in 8 bits of grey; Pillow would clip 16 of them."""
+    """Return the image as 8-bit grey; Pillow would clip 16-bit values to 255."""
     if image.mode.startswith("I;16"):
         return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
     return image.convert("L")
@@ -227,7 +227,7 @@ def _grey(image: Image.Image) -> Image.Image:
 def _srgb_from_profile(rgb: Image.Image, profile: bytes) -> Image.Image:
     """Return ``rgb`` converted from its ICC ``profile`` to sRGB, relative colorimetric.
 
-    It stays as it is if the profile is sRGB's, is not one of RGB, or is damaged.
+    The image is not changed if the profile is that of sRGB, is not for RGB, or is damaged.
     """
     with suppress(ImageCms.PyCMSError, *_FAULTS):
         source = ImageCms.getOpenProfile(io.BytesIO(profile))

@@ -1,8 +1,8 @@
 """Frames of a video as upright 8-bit sRGB, through PyAV.
 
-Presentation times, rotation, matrix, range and transfer are the stream's. Without them: limited range, BT.709
-from 720 lines on and BT.601 below, as players do. Standard dynamic range is treated as sRGB without change,
-because a display shows both alike. HLG and PQ go through `cleargs.media.colour.srgb_from_hdr`.
+Presentation times, rotation, matrix, range and transfer are those of the stream. The defaults are those of
+players: limited range, BT.709 from 720 lines on, BT.601 below. Standard dynamic range is treated as sRGB,
+because a display shows both alike. HLG and PQ are converted by `cleargs.media.colour.srgb_from_hdr`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _FULL_RANGE = 2
 _PREVIEW = 0.1
 _PROGRESSIVE = 1  # AVFieldOrder: 0 is unknown, above 1 are those of two fields
 _SLACK_S, _SLACK = 0.5, 0.02
-"""Time by which a video may end before its container says, s and as a share: frame durations are rounded."""
+"""Time by which a video may be shorter than stated, s and as a share: frame durations are rounded."""
 _HINT = "copy the file again, or re-encode what is readable: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4"
 
 
@@ -58,7 +58,7 @@ class Timeline:
     """Time stamps of the frames that were cut off at the start."""
 
     def seconds(self, index: int) -> float:
-        """Return the presentation time of a frame from the first one of the file on, s."""
+        """Return the time of a frame after the first frame of the file, s."""
         return (self.pts[index] - (self.before or self.pts)[0]) * self.time_base
 
     def between(self, start: float | None, end: float | None) -> Timeline:
@@ -121,7 +121,7 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, Image
 
 
 def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
-    """Yield frames like `decode_frames`, but grey [H, W] and as they are stored.
+    """Yield frames like `decode_frames`, but grey [H, W], and neither turned nor stretched.
 
     It is several times as fast. Frames that cannot be decoded, for example at the start of a clip that was
     cut out of another, are left out.
@@ -157,7 +157,7 @@ def _progressive(container: InputContainer, stream: VideoStream) -> Iterator[Vid
     ).configure()
     for frame in (*container.decode(stream), None):
         graph.vpush(frame)
-        with suppress(av.error.BlockingIOError, av.error.EOFError):  # it asks for the next, or is through
+        with suppress(av.error.BlockingIOError, av.error.EOFError):  # it needs the next frame, or has ended
             while True:
                 made = graph.vpull()
                 if made.pts is not None and made.time_base and stream.time_base:
@@ -171,7 +171,7 @@ def _require_few(subject: str, width: int, height: int, what: str = "pixels") ->
 
 
 def _oriented(frame: VideoFrame, width: int) -> ImageU8:  # [H, W, 3]
-    """Return a decoded frame as upright sRGB; ``width`` is that with square pixels, before it is turned."""
+    """Return a decoded frame as upright sRGB; ``width`` is its width in square pixels before rotation."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
     if width != frame.width:
         rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -213,7 +213,7 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 raise InputError(f"{path.name} holds no video", hint="give a video, or a folder of images")
             streams = container.streams.video
             stream = streams[_by_merit(path)[0] if len(streams) > 1 else 0]
-            if stream.codec_context is None:  # FFmpeg does not know its form
+            if stream.codec_context is None:  # FFmpeg does not know the codec
                 raise InputError(f"{path.name} is in a form that cannot be decoded", hint=_HINT)
             if min(stream.width, stream.height) < 1:
                 raise InputError(f"{path.name} is damaged: its header gives the picture no size", hint=_HINT)
@@ -227,8 +227,8 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 def _by_merit(path: Path) -> list[int]:
     """Return the numbers of the video streams in ``path``, best first, without attached and single pictures.
 
-    The best has the most pixels over all its frames, which are counted. One with less than a tenth of them is
-    a preview.
+    The best stream has the most pixels, summed over all its frames. Streams with less than a tenth of its
+    pixels are previews and are left out.
     """
     with av.open(path, metadata_errors="replace") as container:
         streams = container.streams.video
@@ -244,9 +244,9 @@ def _by_merit(path: Path) -> list[int]:
 
 
 def _stated_seconds(container: InputContainer, stream: VideoStream) -> float:
-    """Return the length of a Matroska video, s; 0 if the file does not state it, or counts its frames.
+    """Return the stated length of a Matroska video, s; 0 if it is unknown, or if the file counts its frames.
 
-    Its one length is that of the longest stream, so it speaks for the video only where that is alone.
+    Matroska states only the length of the longest stream, so it is used only if the video is the only one.
     """
     if stream.frames or not container.format.name.startswith("matroska") or len(container.streams) > 1:
         return 0.0

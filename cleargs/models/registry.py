@@ -184,7 +184,7 @@ def model_file(spec: str, role: Role) -> Path | None:
 def load_network(
     spec: str, role: Role, device: str, from_file: Callable[[Path, RegistryEntry | None], T]
 ) -> T:
-    """Load the expert or scorer that a setting names, by `model_file`.
+    """Load the expert or scorer that a setting names (see `model_file`).
 
     ``from_file`` loads a file; it also receives the registry's entry or None. It is not used for plugins.
     InputError is raised if the name is unknown, or the model is not installed or damaged.

@@ -153,7 +153,7 @@ class MusiqScorer:
 
 
 def patches(image: ImageF32) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
-    """Cut an image [H, W, 3] into patches as pyiqa: at full size and with longer sides of 224 and 384 px.
+    """Cut an image [H, W, 3] into patches as pyiqa does: at full size, and at longer sides of 224 and 384 px.
 
     Returns them [N, 3, 32, 32] in [-1, 1], their cells in the position grid [N], and indices of sizes [N].
     """

@@ -1,1 +1,1 @@
-"""The runner and the store of results. They decide which stages run; they know nothing of splats."""
+"""The runner, which decides which stages run, and the store of results. Both are independent of splats."""

@@ -37,7 +37,7 @@ class Config:
     sections: Mapping[str, BaseModel]
     """Stage -> its settings, with the defaults filled in."""
     effective: Mapping[str, BaseModel]
-    """The same as the settings of other stages change them: the stages run with these, and keys hold them."""
+    """Stage -> its settings as changed by those of other stages. Runs use these, and keys hold them."""
 
     def document(self) -> Document:
         """Return the full configuration for TOML, which has no null: settings that are None are left out."""
@@ -159,7 +159,7 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
 def known_settings(dag: Dag, document: Mapping[str, Any]) -> tuple[Document, list[str]]:
     """Return the settings of ``document`` that this version has, and the names of the others.
 
-    Files of runs that another version wrote can have others.
+    The file of a run that another version wrote may have others.
     """
     tables = {name: dag.load(name).CONFIG for name in dag.names}
     known: Document = {"seed": document["seed"]} if "seed" in document else {}

@@ -25,7 +25,7 @@ class Dag:
     With ``say``, the pace is measured unless it is known, which takes seconds, and ``say`` announces it.
     """
     gpu_fault: Callable[[BaseException], str | None] = lambda error: None
-    """Return in one line what failed on the GPU if that is the cause of an error, else None."""
+    """Return one line about the GPU failure that caused an error; None if the GPU is not the cause."""
 
     def check(self, name: str) -> str:
         """Return ``name`` if it is a stage; raise InputError with the nearest name otherwise."""

@@ -75,8 +75,8 @@ def differences(
 ) -> list[str]:
     """Return one readable line per difference between two keys.
 
-    The files are "STAGE/PATH" (an input) or a role (an external) -> file -> digest, so that a line can name
-    those that changed.
+    ``old_files`` and ``new_files`` are "STAGE/PATH" (an input) or role (an external) -> file -> digest, so
+    that a line can name the files that changed.
     """
     lines = []
     if old.version != new.version:

@@ -61,7 +61,7 @@ def exclusive_lock(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
 
 
 def is_locked(path: Path) -> bool:
-    """Return True if a process holds ``path`` alone, or if the file system cannot tell."""
+    """Return True if a process holds an exclusive lock on ``path``, or if the file system has no locks."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

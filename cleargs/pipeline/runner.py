@@ -181,7 +181,7 @@ class Runner(Planner):
         return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.parts.key))
 
     def _rehashed_key(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
-        """Return the key of ``name`` after reading all inputs again: a failing disk keeps time stamps.
+        """Return the key of ``name`` after reading all inputs again: a failing disk changes no time stamp.
 
         Raises StoreError if an upstream result is damaged.
         """

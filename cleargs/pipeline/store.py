@@ -170,10 +170,10 @@ class Store:
 
         A ``forced`` rebuild has a separate folder, and resumes only from a forced attempt. Otherwise, usable
         results in ``entry`` are copied to the outputs, unless there are outputs already. Files of a killed
-        attempt stay only if they match ``leftovers``, and checkpoints only next to the outputs that they
-        continue: a process that was killed right after `publish` moved the outputs leaves checkpoints alone.
-        Without the lock of the key, this process works in its own folder, which takes over the common one if
-        there is one.
+        attempt stay only if they match ``leftovers``. Checkpoints stay only with the outputs that they
+        continue: a process that is killed right after `publish` moved the outputs leaves only checkpoints.
+        Without the lock of the key, this process works in its own folder. The common folder, if there is one,
+        is renamed to this folder.
         """
         work = WorkFolder(self.root / "work" / (f"{key}.forced" if forced else key))
         with disk_errors(work.folder):

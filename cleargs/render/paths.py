@@ -74,8 +74,8 @@ def turntable(cameras: Sequence[Camera], count: int) -> ArrayF64:  # [count, 4, 
     """Return ``count`` poses on a circle around the point that ``cameras`` look at.
 
     The axis is `up_axis`. Radius and height are the medians over the cameras. The path starts near the first
-    camera. It is a full turn, or if the cameras leave out more than `WIDEST_GAP` of it, it goes back and
-    forth along the part that they saw. InputError is raised if all cameras look in the same direction.
+    camera and makes a full turn. If a gap between the cameras exceeds `WIDEST_GAP`, it goes back and forth
+    over the rest of the circle instead. Raises InputError if all cameras look in the same direction.
     """
     centre = seen_point(cameras)
     up = up_axis(cameras)

@@ -59,7 +59,7 @@ def parse_crop(rule: str | None) -> tuple[float, ...] | None:
 
 
 def _parsed(rule: str, **counts: int) -> tuple[str, tuple[float, ...]]:
-    """Split KIND:NUMBER,NUMBER... Return no numbers if they are not as many as ``counts`` has for KIND."""
+    """Split KIND:NUMBER,NUMBER... Return no numbers if their count is not that of KIND in ``counts``."""
     kind, _, numbers = rule.partition(":")
     try:
         values = tuple(float(number) for number in numbers.split(","))

@@ -108,7 +108,7 @@ def render_run(
 def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
     """Return the shots of the prepared capture ``ingest``, all of one size.
 
-    It is that of the frames where ``options`` have none, one pixel more where a film needs an even number.
+    Without a size in ``options``, it is that of the first camera; a film gets one pixel more per odd side.
     Raises InputError if no frame has a pose.
     """
     listed = load_frames(ingest)
@@ -152,9 +152,9 @@ def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
 def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | None = None) -> list[Camera]:
     """Read the cameras of a ``cameras.json`` or ``transforms.json``, in normalised coordinates.
 
-    ``lens`` has the size and intrinsics that the file lacks; distortion is ignored. ``similarity`` transforms
-    the coordinates of the input. ``world`` is that of the file (default: normalised for cameras.json, input
-    for transforms.json). Raises InputError if the file has another form, or a pose is not rigid.
+    ``lens`` gives the size and intrinsics that the file lacks; distortion is ignored. ``similarity`` maps
+    input coordinates to normalised ones. ``world`` is that of the file (default: normalised for cameras.json,
+    input for transforms.json). Raises InputError if the file has another form, or a pose is not rigid.
     """
     try:
         document = read_json(path)
@@ -200,7 +200,7 @@ def _of_transforms(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[C
 
 
 def _with_lens(lens: Camera, entry: Mapping[str, Any]) -> Camera:
-    """Return ``lens`` with those of size, focal lengths and principal point that ``entry`` has."""
+    """Return ``lens`` with the size, focal lengths and principal point of ``entry``, if they are given."""
     scaled = lens.resized(int(entry.get("width", lens.width)), int(entry.get("height", lens.height)))
     numbers: dict[str, Any] = {name: float(entry[name]) for name in ("fx", "fy", "cx", "cy") if name in entry}
     if "fx" in numbers:

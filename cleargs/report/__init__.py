@@ -1,1 +1,1 @@
-"""Reports for users: the page of a run, its live server, and the picture of the allocation."""
+"""Reports for users: the page of a run, and the server that shows its progress."""

@@ -1,7 +1,7 @@
 """The advice of a report: commands that may improve the result, with their expected time and gain.
 
-The gains in dB were measured at held-out frames of real captures (docs/experiments/speed.md). The order of
-the others is a judgement.
+The gains in dB were measured at held-out frames of real captures (docs/experiments/speed.md). Advice without
+a measured gain is ordered by judgement.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from cleargs.report.verdict import figure_of
 from cleargs.splat.config import steps_from_frames
 
 FEW_PLACED = 0.8
-"""Share of frames with a pose, below which there is advice on them."""
+"""Share of frames with a pose below which the report gives advice on the other frames."""
 BLURRED_PX = 6.0
 """Motion blur above which a frame counts as blurred, px."""
 SHORT = 0.8
@@ -45,7 +45,7 @@ class Advice(NamedTuple):
     why: str
     gain: str
     worth: float
-    """Order of the advice: the expected gain in dB, or a judgement in its place."""
+    """Rank of the advice, largest first: the expected gain in dB, or a value chosen by judgement."""
     options: tuple[str, ...] = ()
     """Options of ``cleargs run``; empty if no command helps."""
     command: str = ""
@@ -56,7 +56,7 @@ class Advice(NamedTuple):
 def shown_advice(
     planner: Planner, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
 ) -> list[Advice]:
-    """Return all advice on a run, the most useful first. Holding out frames is never the only command."""
+    """Return advice on a run, the most useful first. Holding frames out is never the only advised command."""
     found = [
         Advice(f"{manifest.stage} is incomplete", missing, "", 9.0)
         for manifest in manifests.values()
@@ -77,7 +77,7 @@ def shown_advice(
 
 
 def command(run: RunSpec, dag: Dag) -> str:
-    """Return the ``cleargs run`` command that reproduces a run, to be called next to its folder."""
+    """Return the ``cleargs run`` command that reproduces a run, as called in the parent of its folder."""
     recipe, changed = _nearest_recipe(run.config, dag)
     words = ["--recipe", recipe] if recipe != "default" else []
     words += ["--seed", str(changed.pop("seed"))] if "seed" in changed else []
@@ -85,7 +85,7 @@ def command(run: RunSpec, dag: Dag) -> str:
 
 
 def _command(run: RunSpec, options: Sequence[str]) -> str:
-    """Return ``cleargs run`` for a capture and a run folder, to be called next to the run folder."""
+    """Return the command ``cleargs run`` with ``options``, as called in the parent of the run folder."""
     place = run.folder.parent
     words = ["run", os.path.relpath(run.source, place), "-o", run.folder.name, *options]
     return f"{program(place)} {shlex.join(words)}"

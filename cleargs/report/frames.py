@@ -46,7 +46,7 @@ MIN_FAULT = 0.2
 """Smaller faults of a frame are not reported."""
 
 LAST_STEPS = 3
-"""Number of the last training steps on a frame whose PSNR is shown as that of the frame."""
+"""Number of last training steps on a frame. The median of their PSNR is shown for the frame."""
 
 MEANINGS = {column.name: column.metadata[b"meaning"].decode() for column in FORMATION}
 """Column of ``formation.parquet`` -> its meaning."""
@@ -69,7 +69,7 @@ class FrameRow:
     """Median PSNR, dB, of the last training steps on the raw frame, as its camera saw it; None if no training
     used the frame."""
     moving: MaskBool | None = None  # [rows, columns]
-    """Cells, which divide the frame evenly, that the training left out since something moves there."""
+    """True for the cells of an even grid that the training ignored, because something moves there."""
 
     @property
     def role(self) -> str:
@@ -80,7 +80,7 @@ class FrameRow:
 
     @property
     def weight(self) -> float | None:
-        """Weight with which the raw frame taught at the end, from 0 to 1; None if it is unknown."""
+        """Weight of the raw frame at the end of the training, from 0 to 1; None if it is unknown."""
         weight: float | None = self.formation.get("weight_after", self.judged.get("weight"))
         return weight
 
@@ -111,7 +111,7 @@ class FrameRow:
 
     @property
     def modelled(self) -> bool:
-        """True where the last scene has a model of what the camera did to the frame."""
+        """True if the last scene has a model of the frame's image formation (blur, rolling shutter)."""
         return self.formation.get("model", "none") != "none" and self.frame.registered
 
     @property
@@ -148,7 +148,7 @@ def faults_of(judged: Mapping[str, Any]) -> dict[str, float]:
 
 
 def scene_with_models(rows: Sequence[FrameRow], run: Path, stages: Collection[str]) -> TrainedScene | None:
-    """Return the last scene of ``run`` where it has a model of any of ``rows``, else None.
+    """Return the last scene of ``run`` if it has a model of image formation for any of ``rows``, else None.
 
     Raises StoreError if a file of the scene is damaged.
     """

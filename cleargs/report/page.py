@@ -51,7 +51,7 @@ _STILL = 960  # long side of the image that is shown until the 3D viewer has loa
 
 
 def page_html(template: str | Template, **values: Any) -> bytes:
-    """Render a template, given itself or as the name of one of the report's. The values are escaped."""
+    """Render ``template``, or the template of the report with this name. The values are escaped."""
     return page_environment().get_template(template).render(version=cleargs.__version__, **values).encode()
 
 
@@ -222,8 +222,8 @@ _POINTS = 120  # maximum number per curve
 def training_curves(run: Path, stages: Sequence[str]) -> dict[str, Any] | None:
     """Return loss, PSNR and number of Gaussians over the training steps; None before the first step.
 
-    Loss and PSNR are those of raw frames: medians over equal intervals, since each step shows one view, and
-    views differ more than steps. Raises StoreError if a table cannot be read.
+    Loss and PSNR are those of steps on raw frames. They are medians over equal intervals: each step shows one
+    view, and views differ more than steps. Raises StoreError if a table cannot be read.
     """
     paths = [(stage, run / stage / "train.parquet") for stage in stages]
     tables = {stage: read_table(path, TRAIN) for stage, path in paths if path.is_file()}

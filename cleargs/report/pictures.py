@@ -48,8 +48,8 @@ _DARK, _LIGHT = (20, 20, 20), (255, 210, 60)  # border and colour of a drawn pat
 _UNUSED = (214, 69, 48)  # colour of pixels that no training used, sRGB
 
 MAX_RENDERED = 40
-"""Maximum number of frames, evenly along the trajectory, for which the final scene is rendered. It limits the
-time."""
+"""Maximum number of frames with a render of the final scene, evenly along the trajectory: it limits the time.
+Held-out frames are rendered in addition."""
 
 
 class ImageFile(NamedTuple):
@@ -81,8 +81,8 @@ def write_pictures(
 ) -> dict[int, FramePictures]:
     """Write the thumbnails and layers of all frames. Return frame_id -> image files.
 
-    ``final`` renders the last scene; None without one. ``scene`` is the same scene with the formations of its
-    frames; None without a model of any.
+    ``final`` renders the last scene; None without one. ``scene`` is the same scene with the image formation
+    of its frames; None if it has no model of any frame.
     """
     (report / FOLDER).mkdir(parents=True)
     placed = [row.frame.frame_id for row in rows if final and row.frame.registered]
@@ -115,9 +115,9 @@ def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -
 def formed_layers(
     row: FrameRow, run: Path, scene: TrainedScene | None, side: int | None = None
 ) -> dict[str, ImageU8]:
-    """Return the layers of a frame that no EXR holds, computed from its formation; none without a model.
+    """Return the layers that image formation gives for a frame without an EXR; none without a model of it.
 
-    ``scene`` is the last scene. ``side`` is the longest side of the layers, px; None for the frame's.
+    ``scene`` is the last scene. ``side`` is the longest side of the layers, px; None for the frame's size.
     """
     tried = row.selection is not None and row.selection.exr is not None
     if scene is None or tried or not row.modelled:
@@ -128,7 +128,7 @@ def formed_layers(
 
 
 def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
-    """Return layer -> image [H, W, 3] sRGB: the raw frame, and the other layers of its latest round.
+    """Return layer -> image [H, W, 3] sRGB: the raw frame, its moving parts, and layers of the latest round.
 
     Raises InputError if an image cannot be read, and StoreError for the file of the layers.
     """

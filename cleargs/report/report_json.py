@@ -47,10 +47,10 @@ def write_report_json(folder: Path, manifests: Mapping[str, Manifest]) -> None:
 def cameras_of(manifests: Mapping[str, Manifest]) -> dict[str, Any]:
     """Return how the cameras were placed, by ingest's manifest; empty without one.
 
-    ``method`` is "given", "adjusted", "sfm over given" (SfM, laid over the given cameras) or "sfm".
-    ``off_px_before`` and ``off_px`` are the median errors (px) of matches that took no part, at the given
-    poses and those of the method; None if not measured. ``lenses`` has lens, focal length and frames of
-    each camera, ``placed`` the number of frames by the way in which they were placed.
+    ``method`` is "given", "adjusted", "sfm over given" (SfM, aligned to the given cameras) or "sfm".
+    ``off_px_before`` and ``off_px`` are the median errors (px) of matches that the fit did not use, at the
+    given poses and at those of the method; None if not measured. ``lenses`` has lens, focal length and number
+    of frames of each camera. ``placed`` has the number of frames by the way in which they were placed.
     """
     if (ingest := manifests.get("ingest")) is None:
         return {}

@@ -61,7 +61,7 @@ class Server(ThreadingHTTPServer):
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """One request."""
+    """Handler of one request: the live page and its data, the preview, or a file of the report."""
 
     server_version, sys_version = "cleargs", ""
     timeout = 30

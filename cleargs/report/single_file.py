@@ -18,7 +18,7 @@ _BASE64 = 4 / 3  # size ratio
 
 
 def single_file_size(folder: Path) -> int:
-    """Return about how many bytes the report in ``folder`` takes as one file, without its text."""
+    """Return the approximate size in bytes of the report in ``folder`` as one file, without its text."""
     images = sum(file.stat().st_size for file in folder.rglob("*.jpg"))
     scripts = sum((folder / name).stat().st_size for name in _SCRIPTS if (folder / name).is_file())
     return round(_BASE64 * images) + scripts
@@ -27,8 +27,8 @@ def single_file_size(folder: Path) -> int:
 def write_single_file(page: Path, target: Path) -> int:
     """Write the report at ``page`` as one HTML file, and return its size in bytes.
 
-    Images that the page shows at once replace their links. Others are in the object ``window.files``. Raises
-    StoreError if the file cannot be written.
+    Images that the page shows at once are put in place of their links. The others are in the object
+    ``window.files``. Raises StoreError if the file cannot be written.
     """
     folder = page.parent
     images = {
@@ -52,5 +52,5 @@ def write_single_file(page: Path, target: Path) -> int:
 
 
 def for_others(html: str, run: Path) -> str:
-    """Return a page of ``run`` whose commands do not have the path of this machine's program."""
+    """Return a page of ``run`` with ``cleargs`` in its commands, not the path of this machine's program."""
     return html.replace(f"{escape(program(run.parent))} ", "cleargs ")

@@ -1,7 +1,7 @@
 """The scene of a report: compressed for the browser, with camera poses for the 3D viewer.
 
 The viewer is PlayCanvas's SuperSplat Viewer. It rotates each PLY by 180 degrees about z, so that y points up.
-Poses are rotated too. Its cameras have no roll, so the page rotates them as those of the frames.
+Poses are rotated too. The viewer's cameras have no roll, so the page gives them the rotations of the frames.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The three candidates of a target frame (the paper's Table "RIVR candidates"), and the choice between them.
+"""The candidates of a target frame t (the paper's Table "RIVR candidates"), and the choice between them.
 
-The primary scorer decides (MUSIQ in the paper); when the best two of its scores are within a margin, the
-tie-break scorer decides among the candidates within it (CLIP-IQA in the paper). Images are [H, W, 3] float32
-sRGB in [0, 1].
+They are the render R_t, the restored frame D_t and the fusion F_t of both. O_t is the raw frame. The primary
+scorer decides (MUSIQ in the paper). If the best two of its scores are within a margin, the tie-break scorer
+(CLIP-IQA in the paper) decides among the candidates within it. Images are [H, W, 3] float32 sRGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from cleargs.types import ArrayF64, ImageF32
 
 CandidateName: TypeAlias = Literal["render", "restored", "fused"]
 Chosen: TypeAlias = Literal["render", "restored", "fused", "observed"]
-"""A candidate, or the raw frame O_t, which needs none."""
+"""A candidate, or the raw frame O_t if it needs no repair."""
 
 Source: TypeAlias = Literal["observation", "deblurred", "render"]
-"""Image from which D_t was restored: O_t, O_t without the camera's motion, or R_t."""
+"""Image that the expert restored to D_t: O_t, O_t without the camera's motion, or R_t."""
 
 CANDIDATES: tuple[CandidateName, ...] = ("render", "restored", "fused")
 """R_t, D_t and F_t; in a perfect tie the earlier one is chosen."""
 
 NEGLIGIBLE = 0.15
-"""Change by the repair, as a share of the error of the render, below which there is nothing to repair
+"""Squared change by a repair, over the squared error of the render, below which there is nothing to repair
 (docs/experiments/rivr.md)."""
 
 EXPLAINED = "explained: "
-"""Begin of the reason of a row whose frame the formation explains."""
+"""Prefix of the reason in a row whose frame image formation explains."""
 
 KEPT = "needs no repair"
-"""The reason of a row whose raw frame is kept."""
+"""Reason in a row whose raw frame is kept."""
 
 
 def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:

@@ -1,4 +1,4 @@
-"""Joint distillation of raw frames and repairs into the scene."""
+"""Distillation: training of the scene on raw frames and repairs together."""
 
 from __future__ import annotations
 
@@ -67,17 +67,17 @@ class Deblurred:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """A raw frame as the training explains it."""
+    """The training's explanation of a raw frame: the render after image formation."""
 
     image: ImageF32
     """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
     formation: FrameFormation
     weight: float
-    """The frame's weight at the end of the training: RVA's, or the weight that it has earned."""
+    """The frame's weight at the end of the training: RVA's, or a higher one by its misfit."""
 
 
 def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
-    """Return O_t as float32 sRGB, and its mask."""
+    """Return the raw frame O_t [H, W, 3], float32 sRGB in [0, 1], and its mask [H, W] (None: all count)."""
     pixels, mask = view.load()
     return to_float32(pixels), mask
 
@@ -95,11 +95,11 @@ class TrainedScene:
         self.scene = read_ply(folder / SCENE).to(device)
         self._written_exposure = read_exposure(folder / EXPOSURE)
         self.exposure = self._written_exposure if self._written_exposure.enabled else None
-        """The affines of the frames; None where compensation is off."""
+        """The colour affines of the frames; None if exposure compensation is off."""
         self.formations, self._weights = read_formation(folder / FORMATION)
         # A scene of an older version has no such table.
         self.moving = read_movement(folder / MOVEMENT) if (folder / MOVEMENT).is_file() else {}
-        """Cells that move, by frame_id."""
+        """frame_id -> mask of the cells of the frame in which something moves."""
         self._engine = rasteriser_for(device)
 
     def render(self, view: TrainingView) -> ImageF32:
@@ -113,9 +113,9 @@ class TrainedScene:
         return render_observed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
     def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
-        """Return the PSNR, dB, of the pixels that no training saw; None where there are none.
+        """Return the PSNR, dB, of the pixels that no training saw; None if there are none.
 
-        `MAX_EVALUATED` of ``views`` count at most.
+        At most `MAX_EVALUATED` of ``views``, evenly spread, are evaluated.
         """
         few, engine = spread(views, MAX_EVALUATED), self._engine
         fits = evaluate_views(
@@ -124,24 +124,24 @@ class TrainedScene:
         return pooled_unseen(fits)
 
     def still(self, view: TrainingView, mask: MaskBool | None) -> MaskBool | None:
-        """Return the pixels of ``mask`` in which nothing moves; None: all."""
+        """Return ``mask`` without the pixels in which something moves; None: all pixels count."""
         if view.frame_id not in self.moving:
             return mask
         pixels = still_pixels(self.moving[view.frame_id], view.camera.height, view.camera.width)
         return pixels if mask is None else pixels & mask
 
     def explained(self, view: TrainingView) -> Explained | None:
-        """Return a raw frame as the training explains it; None without a model of the frame."""
+        """Return the training's explanation of a raw frame; None without a model of the frame."""
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return None
         return Explained(self._render_observed(view).numpy(), formation, self._weights[view.frame_id])
 
     def deblur(self, view: TrainingView) -> Deblurred | None:
-        """Return the raw frame without its motion or defocus; None where nothing explains the frame.
+        """Return the raw frame without its motion or defocus; None if no model explains the frame.
 
-        A formation that the training has estimated is used as it is. That of a frame that the training has
-        not seen is estimated here.
+        If the training has estimated the formation of the frame, that is used. Otherwise it is estimated
+        here.
         """
         observed, mask = observation(view)
         affine = self._affine(view)
@@ -164,7 +164,7 @@ class TrainedScene:
         return Deblurred(_deblurred(formed, self._with_depth(formed.camera), observed, mask), found)
 
     def formed_layers(self, view: TrainingView, factor: float = 1.0) -> dict[str, ImageF32]:
-        """Return a raw frame, reduced by ``factor``, without its motion and as the scene explains it.
+        """Return two images of a frame at scale ``factor``: without its motion, and as the scene explains it.
 
         The layers are named as in an EXR, ``deblurred`` and ``explained``. Without a model of the frame there
         are none.
@@ -199,11 +199,11 @@ class TrainedScene:
         threads: int,
         before: TrainedScene | None = None,
     ) -> Fidelity | None:
-        """Return the agreement of the scene with the held-out frames; None without any.
+        """Return the agreement of the scene with the frames held out from repair; None without any.
 
-        Movement does not count: as found for this scene, or for that ``before``, which it is compared with.
-        A frame is compared with the render with that frame's motion, since a sharp scene is not wrong because
-        raw frames are blurred and skewed by the camera's motion.
+        Pixels that move do not count: those of the scene ``before``, to compare with, or else of this scene.
+        For PSNR, the render has the motion of the frame, since a sharp scene is not wrong because raw frames
+        are blurred and skewed by the camera's motion.
         """
         values, scores = [], []
         for view in holdout:
@@ -233,8 +233,8 @@ class TrainedScene:
         A finished training is read back. An interrupted one resumes from its checkpoint, which is deleted at
         the end.
 
-        A share ``pseudo_share`` of the steps draws a repair; ``even`` draws each as often as any raw frame.
-        The share is reduced by ``repaired``, since a few repairs must not be drawn as often as all frames
+        ``even`` draws each repair as often as each raw frame. Otherwise a share of ``pseudo_share`` times
+        ``repaired`` of the steps draws a repair: a few repairs must not be drawn as often as all frames
         together.
         """
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
 """Gates that a repair must pass before it supervises: it must agree with the raw frame or with the render.
 
-Blur moves light by a few pixels, but neither the content of the frame nor its mean colour. Every block of a
-repair is therefore in the place of the raw frame O_t or of the render R_t, and has the colours of one of the
-two. The scorers of the selection see one image at a time and cannot notice a difference.
+Blur moves light by a few pixels, but it changes neither the place of content nor its mean colour. Every block
+of a correct repair is therefore at its place in the raw frame O_t or in the render R_t, and has the colours
+of one of the two. The scorers cannot check this, because they see one image at a time.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from cleargs.types import ArrayF64, ImageF32, MaskBool
 BLOCK = 64
 """Side of the blocks that are compared, px."""
 ALIGNED_EVERY, COLOUR_EVERY = 32, 16
-"""Distance of neighbouring blocks whose places, and whose colours, are compared, px."""
+"""Distance between the starts of neighbouring blocks, px, in the checks of places and of colours."""
 REACH = 8
 """Longest shift that is searched along each axis, px."""
 
 REFUSED = "repair refused: "
-"""Begin of the reason of a choice when the repair was not among the candidates."""
+"""Prefix of the reason of a choice if the repair was refused as a candidate."""
 
 _FLAT = 0.02  # a block of lower standard deviation has too little texture to be aligned
 _AT_REST = 0.8  # see `_lengths`
@@ -129,11 +129,11 @@ def _spectra(blocks: ArrayF64) -> NDArray[np.complex128]:
 def _lengths(cross: NDArray[np.complex128], side: int) -> ArrayF64:
     """Return the length of each block's shift, px, from its cross-power spectrum [N, S, S // 2 + 1].
 
-    Phase correlation, half whitened: fully, the noise that blur leaves at high frequencies would drown the
-    peak; not at all, the peak would be broad. A symmetric blur of either image leaves it in its place, and
-    the parabola through it and its neighbours gives the fraction. Along a lone edge the correlation is a
-    ridge, and its highest point is chance: where it is nearly as high (`_AT_REST`) without any shift, there
-    is none.
+    This is phase correlation with half whitening. With full whitening, the noise that blur leaves at high
+    frequencies would hide the peak. Without whitening, the peak would be broad. A symmetric blur of either
+    image does not move the peak. A parabola through the peak and its neighbours gives fractions of a pixel. A
+    lone edge makes a ridge, whose highest point is random: if the correlation without a shift is nearly as
+    high (`_AT_REST`), the shift is 0.
     """
     correlation = np.fft.irfft2(cross / np.sqrt(np.abs(cross) + 1e-9), (side, side))
     reach = min(REACH, side // 2 - 1)

@@ -44,7 +44,7 @@ class HarmVerdict:
     """The decision about a distilled scene, with the figures behind it."""
 
     frames: list[int]
-    """The held-out frames. Without any, every scene is published."""
+    """The frames held out from repair. Without any, every scene is published."""
     psnr_before: float | None
     psnr_after: float | None
     score_before: float | None
@@ -56,7 +56,7 @@ class HarmVerdict:
 def judge_harm(
     frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
 ) -> HarmVerdict:
-    """Compare a distilled scene with G0 on the held-out ``frames``; without frames there is no harm.
+    """Compare a distilled scene with G0 on ``frames`` held out from repair; without any there is no harm.
 
     Harm is a fall of the mean PSNR or of the mean primary score by more than its margin: repairs may neither
     bend the scene away from its best observations nor soften it.

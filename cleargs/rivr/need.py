@@ -1,7 +1,7 @@
 """The frames that image formation and RVA leave in need of a repair.
 
-Candidates are made in every run, so that the decisions about them can be inspected: where few frames are in
-need, the next in the order fill up.
+Every run makes candidates, so that the decisions about them can be inspected: if few frames are in need, the
+next ones in the order are added.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from cleargs.rva.allocation import Role
 Targets: TypeAlias = Literal["auto", "all"]
 
 UNEXPLAINED = 2.0
-"""Misfit over the median misfit from which a frame is in need: it has less than half a weight of trust, see
-`rounds.TRUSTED`."""
+"""A frame is in need if its misfit (mean difference from its render) is above this times the median misfit.
+Its weight by the misfit is then below `rounds.TRUSTED`."""
 MIN_SHARE, MIN_TRIED = 1 / 16, 2
 """Share of the frames, and number of frames, that are tried at least."""
 
@@ -29,10 +29,10 @@ MIN_SHARE, MIN_TRIED = 1 / 16, 2
 def frames_to_repair(
     which: Targets, supervision: Supervision, formations: Mapping[int, FrameFormation]
 ) -> list[int]:
-    """Return the frames that every round repairs, by frame_id; never a held-out one.
+    """Return the frames that every round repairs, by frame_id; never one that is held out from repair.
 
-    ``which`` is ``all``, or ``auto``: those in need by the formations of the training before, filled up to a
-    sixteenth of the frames.
+    ``which`` is ``all``, or ``auto``: those in need by the ``formations`` of the last training, and the next
+    ones up to a sixteenth of the frames.
     """
     frames = supervision.candidates
     if which == "all":
@@ -55,7 +55,7 @@ def frames_to_repair(
 def rows_of_others(
     targets: Collection[int], supervision: Supervision, formations: Mapping[int, FrameFormation]
 ) -> list[Selection]:
-    """Return a row for every frame that no round repairs, which says why it is kept as filmed."""
+    """Return a row for every frame that no round repairs, with the reason to keep it as filmed."""
     return [
         Selection.not_tried(frame_id, _reason_to_keep(frame_id, supervision, formations.get(frame_id)))
         for frame_id in supervision.views

@@ -1,7 +1,7 @@
-"""One round of RIVR: every target frame restored, its candidates scored, one of them chosen, all in an EXR.
+"""One round of RIVR: restore every target frame, score its candidates, choose one, store them in an EXR.
 
-The EXR holds the candidates and, as attributes, the frame's row of the selection table. It appears whole or
-not at all, so a round that was cut off resumes at the first frame without one.
+The EXR holds the candidates and, as attributes, the frame's row of the selection table. It is written
+atomically, so an interrupted round resumes at the first frame without an EXR.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ PREFIX = "cleargs:"
 """Prefix of the names of the attributes in the EXR."""
 
 _OPTIONAL = ("primary_fused", "primary_observed", "tiebreak_fused", "tiebreak_observed", "blur_px", "skew_px")
-"""Attributes that an EXR has only where its candidates do."""
+"""Attributes that an EXR lacks if the row has no such value."""
 
 TRUSTED = 0.5
-"""Weight from which a frame that the formation explains supervises by itself instead of by a repair."""
+"""Minimum weight of a frame that image formation explains and that supervises without a repair."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """Rules for restoring a frame, making its candidates and choosing one of them: fields of the settings."""
+    """Rules for restoring a frame, making its candidates and choosing one of them, from the settings."""
 
     expert: Expert
     primary: Scorer
@@ -70,7 +70,7 @@ class Rules:
     def restored(
         self, view: TrainingView, render: ImageF32, scene: TrainedScene
     ) -> tuple[ImageF32, Source, Deblurred | None]:
-        """Restore a frame; R_t is ``render``. The motion that ``scene`` knows of it is undone first.
+        """Restore a frame, after undoing the motion that ``scene`` has found in it. ``render`` is its R_t.
 
         Returns:
             D_t, the kind of image that it was made from, and the deblurred frame if it was made from that.
@@ -86,7 +86,7 @@ class Rules:
         return self.expert.restore(image, threads=self.threads)
 
     def _restored_observation(self, view: TrainingView) -> ImageF32:
-        """Return D_t of a raw frame as read from the cache: every round and resumed run has the same bits."""
+        """Return D_t of a raw frame from the cache: all rounds and resumed runs have the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
             return from_layer(read_exr(path).layers["restored"])
@@ -106,7 +106,7 @@ def run_round(
     reporter: Reporter,
     label: str,
 ) -> list[Selection]:
-    """Repair every target frame in the light of ``scene``; EXRs go to ``out/round_NN/``.
+    """Repair every target frame with the renders of ``scene``. EXRs are stored in ``out/round_NN/``.
 
     Frames with an EXR are skipped. An EXR that is damaged, or of another frame or round, is replaced, with a
     warning.
@@ -160,7 +160,7 @@ def repair(
         if explained is not None and explained.weight >= TRUSTED:
             kept = f"{EXPLAINED}{described(explained.formation)}"
         elif (
-            view.weight > 0.0  # without its repair a frame of no weight would be lost
+            view.weight > 0.0  # a frame of weight 0 supervises only by its repair
             and unbeaten(raw[0], primary, rules.margin)
             and unbeaten(raw[1], tiebreak, rules.margin)
             and is_negligible_change(observed, shown["restored"], shown["render"])

@@ -67,7 +67,7 @@ class Selection:
 
     @classmethod
     def not_tried(cls, frame_id: int, reason: str) -> Selection:
-        """Return the row of a frame that is kept as filmed without a candidate."""
+        """Return the row of a frame that is kept as filmed and for which no candidate was made."""
         row: dict[str, Any] = dict.fromkeys(SELECTION.names)
         row |= {"round": 1, "frame_id": frame_id, "chosen": "observed", "accepted": False, "reason": reason}
         return cls(**row)

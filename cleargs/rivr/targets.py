@@ -26,20 +26,20 @@ class FrameAssessment:
     B: float
     role: str
     reliable: bool
-    """With RVA on, the strong frames; in the all-view ablation, where all are strong, the sharp ones."""
+    """True if the frame is in RVA's reliable set A: R >= tau_R and B <= tau_B, with any role."""
     stand_in: bool
-    """No frame is reliable, and this one is among the best by R - B."""
+    """True if no frame is reliable and this one is among the best by R - B."""
     weight: float = 1.0
     """Weight of the frame's raw supervision; a frame of weight 0 is never loaded."""
 
 
 def select_holdout(frames: Sequence[FrameAssessment], share: float = 0.125) -> list[int]:
-    """Select frames that get no repairs and measure harm by the repairs of the others, in order.
+    """Select the frames that are held out from repair and measure harm by the repairs of others, in order.
 
-    They are a share (at least one; none for 0) of the reliable frames, or of the stand-in set if there are
-    none: the best by R - B of each of as many equal parts of the trajectory, or among equals the nearest to
-    the middle of the part. Soft frames are not selected, since they would count every gain in sharpness as a
-    loss.
+    They are a ``share`` (at least one; none for 0) of the reliable frames, or of the stand-ins if there are
+    none. These are divided, in order, into that many nearly equal parts. The best frame of each part by R - B
+    is selected, or among equals the nearest to the middle of the part. Soft frames are not selected, since
+    they would count every gain in sharpness as a loss.
     """
     reliable = [frame for frame in frames if frame.reliable]
     references = reliable or [frame for frame in frames if frame.stand_in]
@@ -65,7 +65,7 @@ class FrameGroup:
 
     targets: Sequence[TrainingView]
     steps: int
-    """Steps of the distillation of what was accepted so far, after its frames."""
+    """Steps of the distillation after these frames, on all that was accepted so far."""
 
 
 def trajectory_groups(targets: Sequence[TrainingView], size: int | None, steps: int) -> list[FrameGroup]:
@@ -90,16 +90,16 @@ class Supervision:
     views: dict[int, TrainingView]
     assessments: list[FrameAssessment]
     holdout_ids: list[int]
-    """Frames that get no repairs and measure harm by those of the others."""
+    """Frames that are held out from repair and measure the harm by the repairs of others."""
 
     @property
     def real(self) -> list[TrainingView]:
-        """The active raw frames D_real, including the held-out ones, as for G0."""
+        """The active raw frames D_real, including those held out from repair, as for G0."""
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property
     def candidates(self) -> list[FrameAssessment]:
-        """The frames that may be repaired: all except the held-out ones."""
+        """The frames that may be repaired: all except those held out from repair."""
         return [frame for frame in self.assessments if frame.frame_id not in self.holdout_ids]
 
 

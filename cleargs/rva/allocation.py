@@ -18,7 +18,7 @@ from cleargs.types import ArrayBool, ArrayF64
 
 Roles = npt.NDArray[np.str_]
 
-_ROUNDING = 1e-9  # 0.55 * 20 is 11 frames, not 12
+_ROUNDING = 1e-9  # 0.55 * 100 = 55.00000000000001 is 55 frames, not 56
 
 
 class Rule(StrEnum):

@@ -33,8 +33,8 @@ def make_evaluator(
 ) -> Evaluator:
     """Create the evaluator of the settings.
 
-    ``seed`` is that of a model on a server or of a plugin, ``device`` that of a plugin. ``cache`` is a folder
-    for results of single frames; None: no cache.
+    ``seed`` is for a model on a server or a plugin, ``device`` for a plugin only. ``cache`` is a folder for
+    results of single frames; None: no cache.
 
     Raises:
         InputError: The evaluator is unavailable, for example because the address of its server is invalid.

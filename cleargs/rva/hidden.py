@@ -20,7 +20,7 @@ from cleargs.types import ArrayF64, ArrayInt
 GRID = (5, 8)
 """Parts of a frame: rows and columns."""
 REACH = 3
-"""Frames on either side, one of which on each must see a point."""
+"""Number of frames on either side, of which at least one on each side must see a point."""
 MIN_POINTS, SEEN_AT_MOST = 3, 0.1
 """Fewest expected points of a part, and the largest share of them that a hidden part sees."""
 SEEN_ELSEWHERE = 0.5
@@ -32,7 +32,7 @@ GHOSTING = (0.15, 0.6)
 def with_hidden_parts(
     cues: ArrayF64, frames: Sequence[Frame], points: Points, observations: Observations
 ) -> ArrayF64:  # [N, 11]
-    """Return the cues of ``frames`` with the ghosting of what hides the scene, where that is more."""
+    """Return ``cues`` with b_ghosting raised to the value for the hidden parts, if that is higher."""
     shares = hidden_shares(frames, points.point_id, points.xyz, observations)
     column = CUE_COLUMNS.index("b_ghosting")
     cues = cues.copy()
@@ -46,7 +46,7 @@ def hidden_shares(
     xyz: ArrayF64,  # [P, 3]
     observations: Observations,
 ) -> ArrayF64:  # [N] in [0, 1]
-    """Return the share of the parts of each frame that are hidden, of those where points are expected.
+    """Return, per frame, the share of the parts with expected points that are hidden.
 
     It is 0 for the first and the last frame, and for frames without a pose. ``frames`` are in the order of
     the trajectory.

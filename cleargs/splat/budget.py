@@ -13,11 +13,11 @@ from cleargs.splat.config import TrainConfig
 if TYPE_CHECKING:
     from cleargs.splat.views import TrainingView
 
-# Wall seconds on two idle cores of the reference machine (`cleargs.splat.pace`): per step, constant and by
-# size, ...
+# Wall seconds of a step on two idle cores of the reference machine (`cleargs.splat.pace`): a constant, and
+# the parts that grow with the image and with the number of Gaussians.
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
-# ... and per megapixel for the estimate of a frame's image formation: the first one, where half of the frames
-# are assumed to be searched, and later ones.
+# Wall seconds per megapixel to estimate a frame's image formation: for the first time, under the assumption
+# that half of the frames are searched, and for later times.
 SEARCH_S, SEARCH_AGAIN_S = 0.6, 0.3
 
 Settings = TypeVar("Settings", bound=TrainConfig)
@@ -40,7 +40,7 @@ def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: 
     """Estimate the wall seconds of each step on two idle cores, [length].
 
     Later steps take longer, as the number of Gaussians grows from ``start``. ``megapixels`` are per frame.
-    ``config`` has steps and budget (`resolve_config`).
+    Steps and budget of ``config`` must be set (`resolve_config`).
     """
     step = config.first + np.arange(config.length)
     reduced = np.where(step < config.coarse_share * config.planned, config.coarse_factor**2, 1.0)
@@ -58,8 +58,8 @@ def training_cost(
 ) -> tuple[float, float]:
     """Estimate the wall seconds of a training on two idle cores, and its GB of memory without the images.
 
-    It begins with ``start`` Gaussians (None: the maximum number). ``megapixels`` are per frame. Open steps
-    and budget are set as in `resolve_config`.
+    The training begins with ``start`` Gaussians (None: the maximum number). ``megapixels`` are per frame.
+    Unset steps and budget are chosen as in `resolve_config`.
     """
     pixels = round(frames * megapixels * 1e6)
     budget = config.budget_for(pixels)
@@ -69,7 +69,7 @@ def training_cost(
 
 
 def resolve_config(config: Settings, views: Sequence[TrainingView]) -> Settings:
-    """Return ``config`` with steps and budget set; open ones follow from the views (see `TrainConfig`)."""
+    """Return ``config`` with steps and budget. Unset ones follow from the views (see `TrainConfig`)."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
     update = {"steps": config.steps_for(len(views)), "budget": config.budget_for(pixels)}
     return config.model_copy(update=update)

@@ -91,8 +91,8 @@ def cameras_json(
 ) -> list[dict[str, Any]]:
     """Return the content of ``cameras.json`` of the Inria code, which viewers read next to a PLY.
 
-    The cameras, with their names, go through the similarity x -> scale rotation x + translation. Each gets
-    one entry, with its centre and its rotation from camera to world.
+    ``cameras`` are names and cameras. The similarity x -> scale rotation x + translation is applied to them.
+    Each gets one entry, with its centre and its rotation from camera to world.
     """
     turn = np.eye(3) if rotation is None else rotation
     shift = np.zeros(3) if translation is None else translation

@@ -8,8 +8,8 @@ float32. A Gaussian stores:
 - the three smaller components of its quaternion (10 bits each) and the index of the largest (2 bits);
 - its opacity (8 bits).
 
-Coefficients of the spherical harmonics above degree 0 have 8 bits for -4 to 4. Source: the writer of
-splat-transform.
+Coefficients of the spherical harmonics above degree 0 have 8 bits for the range from -4 to 4. Source: the
+writer of splat-transform.
 """
 
 from __future__ import annotations
@@ -131,9 +131,9 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
 def smallest_three(
     quaternions: NDArray[np.floating[Any]],  # [N, 4]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # [N], [N, 3]
-    """Return the index of each quaternion's largest component, and the others of the normalised one in order.
+    """Return the index of each quaternion's largest component, and the other three in order.
 
-    Their signs are those for which the largest component, which a decoder can compute, is positive.
+    Quaternions are normalised, and negated if that component is negative: a decoder can then compute it.
     """
     unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)

@@ -74,7 +74,7 @@ class FormationConfig(FrozenModel):
         return ("on" if value else "off") if isinstance(value, bool) else value
 
     accept: ClassVar[float] = 0.02
-    """Share of a frame's misfit that a model must explain to be accepted (docs/experiments/formation.md)."""
+    """Share of the misfit (mean difference) that a model must explain (docs/experiments/formation.md)."""
     trust: ClassVar[float] = 1.0
     """Exponent p in the weight of an explained frame, max(w_RVA, min(1, median misfit / misfit)^p)."""
 
@@ -210,7 +210,7 @@ class TrainConfig(FrozenModel):
         """Number of steps of this training.
 
         Raises:
-            ValueError: The number is open; `cleargs.splat.budget.resolve_config` sets it.
+            ValueError: The number is unset; `cleargs.splat.budget.resolve_config` sets it.
         """
         if self.steps is None:
             raise ValueError("the number of steps is not set yet")

@@ -10,9 +10,9 @@ adds noise to the means of transparent Gaussians. Two rules differ:
 - A drawn Gaussian is split along its longest axis (Deng et al., "Efficient density control", 2024). Two
   copies at the same place would need many steps to separate.
 
-`refine` and what it calls are pure functions on numpy arrays (on one thread, so that results
-do not depend on the number of threads) or on tensors of a GPU: ``xp`` is numpy or torch, whose functions have
-the same names here. The noise is a kernel (`Backend.add_position_noise`).
+`refine` works on numpy arrays (on one thread, so that results do not depend on the number of threads) or on
+tensors of a GPU: ``xp`` is the module numpy or torch, whose functions have the same names here. A kernel adds
+the noise (`Backend.add_position_noise`).
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def relative_error(
 ) -> Tensor:
     """Return squared errors over the variance of ``target`` around each pixel, [H, W, 3] >= 0.
 
-    The variance is the mean of those of the three channels. Masked pixels have no error and do not count in
-    the variances of others. Results do not depend on the number of threads.
+    The variance is the mean over the three channels, plus `CONTRAST_FLOOR`. Masked pixels have the error 0
+    and do not count in the variances of others. Results do not depend on the number of threads.
     """
     counted = torch.ones_like(target[..., :1]) if mask is None else mask[..., None].to(target.dtype)
     values = torch.cat([target, target.square().mean(dim=-1, keepdim=True), counted], dim=-1)
@@ -77,7 +77,7 @@ def relative_error(
 
 def refine(
     arrays: Arrays,  # parameters; they are changed and must not be used again
-    moments: Sequence[Arrays],  # running means of the optimiser, likewise; 0 for both halves after a split
+    moments: Sequence[Arrays],  # running means of Adam, also changed; 0 for both halves after a split
     *,
     errors: Any,  # [N] float64 >= 0
     rate: float,  # maximum growth, as a fraction of N

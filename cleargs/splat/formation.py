@@ -27,7 +27,7 @@ class Formed(Protocol):
     """Weight of the view: the original weight, or more if image formation explains the frame."""
 
     mask: Tensor | None
-    """Pixels [H, W] that count, after `forward`: those of the view in which nothing moves; None: all."""
+    """Pixels [H, W] that count; None: all. After `forward`, those in which something moves are left out."""
 
     def forward(self, render: Render) -> Tensor:
         """Return the observed image [H, W, 3] sRGB of a render."""
@@ -36,7 +36,7 @@ class Formed(Protocol):
         """Return the gradient of the render's image, given that of the observed image [H, W, 3]."""
 
     def learn(self) -> None:
-        """Update the parameters that follow the gradient of the last `backward`."""
+        """Update the learned parameters, by the gradient of the last `backward`."""
 
 
 class Formation(Protocol):
@@ -51,10 +51,10 @@ class Formation(Protocol):
         mask: Tensor | None,  # [H, W] pixels that count
         render: Renderer,  # renders the current scene
     ) -> Formed | None:
-        """Return the image formation for a step on a view, or None to compare it with the plain render."""
+        """Return the image formation for a step on a view. None: compare the view with the plain render."""
 
     def digest(self) -> str:
-        """Return a digest of everything it starts from, which identifies its checkpoints."""
+        """Return a digest of the settings and the initial values, which identifies checkpoints."""
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that the training changes, for a checkpoint."""
@@ -67,14 +67,14 @@ class Formation(Protocol):
 
 
 SATURATED = 253 / 255
-"""Value of a photograph from which it is saturated: the light there was as bright as this or brighter."""
+"""Value (sRGB) from which a photograph is saturated: the light was as bright as this or brighter."""
 
 
 def recorded(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a render as a sensor records it, and where it is brighter than a saturated photograph.
+    """Return a render as the sensor of a photograph records it, and a mask of the values that change.
 
-    Both images are [H, W, 3] sRGB. The values there, per channel, become those of the photograph, since a
-    saturated value is the same for all brighter light. So one overexposed frame does not darken a lamp.
+    Both images are [H, W, 3] sRGB. If the photograph is saturated and the render is brighter, the value of
+    the photograph replaces that of the render. So one overexposed frame does not darken a lamp.
     """
     too_bright = (target >= SATURATED) & (image > target)
     return torch.where(too_bright, target, image), too_bright

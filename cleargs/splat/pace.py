@@ -1,8 +1,8 @@
 """Pace of this machine: its time for a training iteration, relative to the reference machine.
 
 ``python -m cleargs.splat.pace`` prints the milliseconds of processor time that an iteration takes on one
-thread. `REFERENCE_MS` is the output on the reference machine, as are the constants of the stages'
-``estimate``. Measure them together (docs/experiments/speed.md).
+thread. `REFERENCE_MS` is the output on the reference machine. The constants of the stages' ``estimate`` were
+measured on the same machine. Measure all of them together (docs/experiments/speed.md).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TIMEOUT_S = 300
 def machine_pace(say: Callable[[str], None] | None = None) -> float:
     """Return the pace of this machine, greater than 1 for slower machines; 1 if it is unknown.
 
-    It is cached or measured. ``say`` receives a message before a measurement. None: only read the cache.
+    The pace is read from a cache, or measured if ``say`` is given; ``say`` then receives a message first.
     """
     pace = cached_pace()
     if pace is not None or say is None:
@@ -107,7 +107,7 @@ def random_scene(
 
 
 def _cache_file() -> Path:
-    """Return the file of this machine and this `PROBE`; machines of a cluster share their home folder."""
+    """Return the cache file of this machine and `PROBE`. Machines of a cluster share a home folder."""
     machine = {"host": platform.node(), "processor": processor_name(), "probe": PROBE}
     name = hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:16]
     return cache_folder("pace") / f"{name}.json"

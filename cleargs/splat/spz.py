@@ -41,7 +41,7 @@ def spz(scene: Scene) -> bytes:
             f"the scene has coordinates up to {reach:.1e}, but .spz stores at most 8 million",
             hint="export it in the normalised world (without --world input), or in another format",
         )
-    # As many bits as the largest coordinate leaves of 24 bits with sign.
+    # Bits after the binary point: those of the 24 bits (with sign) that the largest coordinate does not need.
     fraction = int(np.clip(np.floor(23 - np.log2(max(reach, 1e-9)) - 1e-9), 0, _FRACTION_BITS_MAX))
     flags = _ANTIALIASED if scene.antialias else 0
     header = struct.pack("<IIIBBBx", _MAGIC, _VERSION, count, gaussians.sh_degree, fraction, flags)

@@ -52,8 +52,8 @@ _CHECK_INTERVAL = 10
 """Steps between checks for NaN and infinity (a check takes less than 1 ms for 50,000 Gaussians)."""
 
 _SHORT_SAVE, _SAVE_SHARE = 0.1, 0.05
-"""Seconds of a checkpoint that is always saved when it is due, and the share of the time that longer ones may
-take. On an H200, 200 steps with up to 400,000 Gaussians take about 3 s, and their checkpoint 0.4 s."""
+"""Checkpoints of up to `_SHORT_SAVE` s are saved whenever they are due. Longer ones take up to this share of
+the time. On an H200, 200 steps with up to 400,000 Gaussians take about 3 s, and their checkpoint 0.4 s."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ class Trainer:
         self,
         scene: Scene,  # to start from; it is copied
         views: Sequence[TrainingView],  # those with weight 0 are ignored
-        config: TrainConfig,  # open steps and budget follow from the views
+        config: TrainConfig,  # unset steps and budget follow from the views
         *,
         seed: Sequence[int],
-        formation: Formation | None = None,  # is updated; None: renders are compared as they are
+        formation: Formation | None = None,  # is updated; None: views are compared with plain renders
         moments: Moments | None = None,  # Adam's, at the end of the previous part of the schedule; None: zero
         pseudo_share: float = 0.0,  # fraction of the steps that use a pseudo view
         pseudo_weight: float = 1.0,  # factor on the loss of pseudo views
@@ -237,7 +237,7 @@ class Trainer:
             self._densify()
 
     def preview(self) -> Tensor:
-        """Return a reduced image [H, W, 3] sRGB of the view with the largest weight, valid for one step."""
+        """Return a small render [H, W, 3] sRGB of the view with the largest weight. The next replaces it."""
         view = max(self._real or self._pseudo, key=lambda view: view.weight)
         camera = view.camera.scaled(min(1.0, _PREVIEW_SIDE / max(view.camera.width, view.camera.height)))
         return self._render(camera, depth=False).image
@@ -386,7 +386,7 @@ class Trainer:
 
 
 class _Looks:
-    """Renders for image formation within one step. The last one also serves the step, if its camera does."""
+    """Renders for image formation within one step. The step reuses the last one if the camera is the same."""
 
     def __init__(self, render: Callable[..., Render], colour: Colour | None, background: Colour) -> None:
         self._render, self._colour, self._background = render, colour, background
@@ -404,7 +404,7 @@ class _Looks:
         return render._replace(image=render.image + empty * change.to(empty.device))
 
     def last_of(self, camera: Camera) -> Render | None:
-        """Return the last render if it is of ``camera``, over the colour of the step."""
+        """Return the last render, over the colour of the step, if its camera equals ``camera``; else None."""
         return self._last if self._last is not None and self._seen_by == _numbers(camera) else None
 
 

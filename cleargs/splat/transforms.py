@@ -20,28 +20,28 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
 MAX_REACH = 1e18
-"""Limit of the size of a scene, whose inverse is the lower limit: the squares of both fit in float32."""
+"""Upper limit of a scene's largest coordinate; the inverse is the lower limit. The squares fit in float32."""
 
 UP: Mapping[str, tuple[tuple[float, ...], ...]] = {
     "-y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
 }
-"""Up axis -> rotation matrix from a world with x right, y down, z forward. Cameras of programs with y up look
-along -z at first, those with z up along y."""
+"""Up axis -> rotation matrix from a world with x right, y down, z forward. The first camera looks along -z in
+programs with y up, and along y in programs with z up."""
 
 _DIRECTIONS = 64
 """Number of directions in which two SH functions are compared; 16 coefficients need at least 16."""
 
 
 ROUNDED = 0.1
-"""Step of single precision, as a share of the median size of the Gaussians, from which positions suffer."""
+"""Largest acceptable rounding step of float32 positions, as a share of the median size of the Gaussians."""
 
 
 def far_offset(gaussians: Gaussians, similarity: Mapping[str, Any]) -> list[float]:
-    """Return whole units to leave out of the translation of ``similarity``; empty where none need be.
+    """Return the whole units to leave out of the translation of ``similarity``; empty if float32 suffices.
 
-    Map coordinates (UTM) have millions of metres, where single precision has steps of half a metre.
+    Map coordinates (UTM) reach millions of metres, where float32 has steps of half a metre.
     """
     translation = np.asarray(similarity["translation"], np.float64)
     size = float(similarity["scale"]) * float(torch.exp(gaussians.log_scales.median()))

@@ -33,7 +33,7 @@ class Reading(NamedTuple):
 
 
 def group(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Return the tensors whose names start with ``prefix``, by the rest of their names."""
+    """Return the tensors whose names start with ``prefix``: rest of the name -> tensor."""
     return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
 
 

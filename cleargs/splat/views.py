@@ -19,7 +19,7 @@ from cleargs.splat.camera import Camera
 from cleargs.types import AnyImage, MaskBool
 
 UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
-"""Side of the blocks that no training sees, and of the cells with one block each, px: 1 % of a frame."""
+"""Side, px, of the blocks that no training sees (1 % of a frame), and of the cells with one block each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +34,11 @@ class TrainingView:
     """A raw frame (real), or its repair (pseudo)."""
     load: Callable[[], tuple[AnyImage, MaskBool | None]]
     """Function that returns the image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and the mask [H, W] (True:
-    the pixel counts) or None. The cache calls it when it needs the image, and again if it could not keep
-    it."""
+    the pixel counts) or None. The cache calls it whenever it needs an image that it does not hold."""
     estimated: bool = False
-    """True if the camera's pose is an estimate, and not one of the input that fits the images."""
+    """True if the pose was estimated or adjusted; False if it is a pose of the input that fits the images."""
     time: float = math.nan
-    """Time at which the frame was taken, s, or its place in the capture where there is no clock; NaN where
-    that is not known."""
+    """Capture time of the frame, s; without a clock, its number in the capture; NaN if neither is known."""
 
 
 class ViewDataset(torch.utils.data.Dataset[dict[str, Any]]):
@@ -85,8 +83,8 @@ def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
     """Return the pixels [H, W] of a frame and of its repairs that no training sees.
 
     They measure the quality of a scene without held-out frames. They form blocks, because the neighbours of a
-    single pixel reveal its colour, at positions with ``frame_id`` as seed. Images with a side of less than
-    two blocks have none.
+    single pixel reveal its colour. The positions are random, with ``frame_id`` as seed. Images with a side of
+    less than two blocks have none.
     """
     unseen = np.zeros((height, width), np.bool_)
     if min(height, width) < 2 * UNSEEN_BLOCK:
@@ -106,8 +104,8 @@ def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
 class ImageCache:
     """Cache of decoded images, with a limit of their memory in bytes, at one scale at a time.
 
-    Images are stored as uint8, or as float16 if they were float32. Images that do not fit pass through the
-    same types, so that results do not depend on the limit. An image that fits stays: replacing the oldest
+    Images are stored as uint8, or as float16 if they were float32. Images that do not fit are also converted
+    to these types, so that results do not depend on the limit. A stored image stays: replacing the oldest one
     would reduce the hit rate in shuffled epochs. With ``training``, masks exclude the `unseen_pixels`.
     """
 

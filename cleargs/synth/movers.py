@@ -1,7 +1,7 @@
 """Movement in a room: a balloon, or a person, a thing that is put elsewhere and a screen that flickers.
 
 The truth has no balloon and no person. It has the thing at its first place, where most frames show it, and
-the screen as it is between its flickers.
+the screen without flicker.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ SWAY = np.array([0.75, 0.08, 0.2])
 """Amplitude of a balloon's motion per axis, metres."""
 
 WALK_RADIUS, WALK_ANGLE = 1.1, np.radians(75)
-"""A person walks on an arc around the focus, from one side to the other, between camera and table: metres,
-and the angle at either end."""
+"""Arc on which a person walks between camera and table: radius around the focus, metres, and the angle at
+either end, radians."""
 HIDDEN = -1000.0
-"""Height of a person outside the room, metres, so far away that ambient light does not notice."""
+"""Height of a person outside the room, metres, too far away to change the ambient light."""
 FLICKERS_PER_SECOND, FLICKER_STOPS = 12.0, 1.5
 """Changes of the screen's brightness, and the largest change in stops."""
 
@@ -33,7 +33,7 @@ class Balloon:
     """
 
     resting = 0
-    """Number of the first items that are also the last of the room, at rest."""
+    """Number of items that the room also contains, at rest: the first items, and its last primitives."""
 
     def __init__(self, room: Room, seed: int) -> None:
         rng = np.random.default_rng([seed, Stream.BALLOON])
@@ -45,7 +45,7 @@ class Balloon:
         self._phases = rng.uniform(0, 2 * np.pi, 3)
 
     def states(self, times: ArrayF64) -> ArrayF64:
-        """Return the centres and the brightness [..., M, 4] at ``times`` [...], seconds; 1: as lit."""
+        """Return the centres and the brightness (1: unchanged) [..., M, 4] at ``times`` [...], seconds."""
         centres = self.items[0]["centre"] + SWAY * np.sin(self._rates * times[..., None] + self._phases)
         return np.concatenate([centres, np.ones((*times.shape, 1))], -1)[..., None, :]
 
@@ -55,7 +55,7 @@ class Severity:
     """Movement of a capture."""
 
     walks: tuple[tuple[float, float], ...]
-    """Begin and end of each crossing by the person, shares of the capture; every second one goes back."""
+    """Begin and end of each walk across the view, shares of the capture; every second walk goes back."""
     elsewhere: tuple[float, float]
     """Begin and end of the time in which the thing is at its second place, shares of the capture."""
     flicker: tuple[float, float]
@@ -68,13 +68,13 @@ SEVERITIES = {
     1: Severity(walks=((0.3, 0.7),), elsewhere=(0.5, 0.75), flicker=(0.1, 0.4), thing=0.14),
     2: Severity(walks=((0.0, 0.48), (0.52, 1.0)), elsewhere=(0.4, 0.8), flicker=(0.1, 0.6), thing=0.24),
 }
-"""By the number of a protocol. The person is in view in about a third, or in two thirds, of the frames."""
+"""`Protocol.moving` -> severity. The person is in view in about a third (1) or two thirds (2) of frames."""
 
 
 class Household:
     """A person who walks through, a thing that is put elsewhere and back, and a screen that flickers.
 
-    ``room`` is without them. The capture takes ``duration`` seconds.
+    ``room`` does not contain them. The capture takes ``duration`` seconds.
     """
 
     def __init__(self, room: Room, duration: float, seed: int, severity: Severity) -> None:
@@ -108,7 +108,7 @@ class Household:
         self._stops = rng.uniform(0.5, 1.0, 4096) * rng.choice([-1.0, 1.0], 4096) * FLICKER_STOPS
 
     def states(self, times: ArrayF64) -> ArrayF64:
-        """See `Balloon.states`. The last of the items belong to the person."""
+        """Return what `Balloon.states` returns. The last three items are the person."""
         shares = times / self._duration
         states = np.ones((*times.shape, len(self.items), 4))
         states[..., :3] = self.items["centre"]

@@ -43,8 +43,8 @@ def phone_lens(width: int, height: int) -> Lens:
 class Shutter:
     """Poses of the rows of the sensor in the S samples of an exposure.
 
-    With a global shutter all rows of a sample have the same pose. With a rolling shutter each row has its
-    window of poses.
+    With a global shutter all rows of a sample have the same pose. With a rolling shutter each row has
+    separate poses, which are later for lower rows.
     """
 
     poses: ArrayF64  # [T, 3, 4] in the order of time
@@ -102,7 +102,7 @@ def distorted(
     lens: Lens,
     coefficients: tuple[float, float, float, float],  # k1, k2, p1 and p2 of OpenCV's model
 ) -> ArrayF64:  # [H, W, 3]
-    """Return what a lens with distortion makes of the image of ``lens``, which has none.
+    """Return the image of a lens with distortion, computed from that of ``lens``, which has none.
 
     The ray of each pixel is found by fixed-point iteration. Pixels whose ray is outside the image repeat its
     border.

@@ -72,7 +72,7 @@ class Orbit:
         return look_at(self._centres(shares), self._focus)
 
     def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
-        """Return a pose off the course by up to 0.22 m per axis, about 1.5 times the distance of frames."""
+        """Return a pose up to 0.22 m per axis off the course, about 1.5 times the step between frames."""
         centre = self._centres(np.array([share]))[0] + rng.uniform(-0.22, 0.22, 3)
         return look_at(centre, self._focus + rng.uniform(-0.08, 0.08, 3))
 
@@ -89,7 +89,7 @@ FPS = 6.0
 FRAMES_PER_PAUSE = 6.0
 """Mean number of frames between slow parts of the walk."""
 PACE_AMPLITUDE = 0.8
-"""The pace is between 1 - PACE_AMPLITUDE and 1 + PACE_AMPLITUDE of its mean."""
+"""The pace is between 1 - PACE_AMPLITUDE and 1 + PACE_AMPLITUDE times its mean."""
 TREMOR_HZ = (1.0, 12.0)
 TREMOR_RADIANS = 0.005
 """Standard deviation of the tremor, about a third of a degree, as of a walking person with a steady hand."""
@@ -118,8 +118,8 @@ class Hand:
     """Rotation of the camera by the hand.
 
     The tremor has the same speed in each band from 1 to 12 Hz, and the hand swings every few frames. If
-    ``stretched``, it shakes strongly in stretches of consecutive frames. Tremor of the position is left out,
-    since rotation moves the image of surfaces more than a step away much more.
+    ``stretched``, it shakes strongly in stretches of consecutive frames. Tremor of the position is left out:
+    rotation moves the image much more, except for surfaces less than a step away.
     """
 
     def __init__(self, duration: float, seed: int, *, stretched: bool = False) -> None:
@@ -164,10 +164,10 @@ class Hand:
 class StillHand:
     """Rotation of a camera that a hand tries to hold still, for photographs with long exposures.
 
-    A drift below 2 Hz and the physiological tremor of 4 to 12 Hz, which swells and fades. Drift and tremor
-    are the two parts of the camera shake that Gavant et al., "A physiological camera shake model for image
-    stabilization systems" (IEEE Sensors 2011), describe. Within an exposure of a fifth of a second the path
-    is bent, its speed is uneven, and it rests where the directions change.
+    It is the sum of a drift below 2 Hz and the physiological tremor of 4 to 12 Hz, which swells and fades.
+    These are the two parts of camera shake in Gavant et al., "A physiological camera shake model for image
+    stabilization systems" (IEEE Sensors 2011). Within an exposure of a fifth of a second the path is bent,
+    its speed is uneven, and it rests where the directions change.
     """
 
     def __init__(self, seed: int) -> None:

@@ -24,8 +24,8 @@ NOISE = 1.5 / 255
 """Standard deviation of the sensor noise at mid grey, sRGB units, for a phone's small pixels indoors."""
 BITS_PER_PIXEL = 0.6
 """Mean rate of the video over a second. The PSNR of decoded frames is about 35 dB, so that artifacts are
-visible as in a phone's video. That has 0.3 bits per pixel at 1080p, but its frames are larger and closer in
-time."""
+visible as in a phone's video. A phone's video has 0.3 bits per pixel at 1080p, but its frames are larger and
+closer in time."""
 SHARPENING_SIGMA = 1.0
 """Standard deviation of the Gaussian of the unsharp mask, pixels of the image."""
 SPOT_POWER = 8

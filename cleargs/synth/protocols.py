@@ -44,9 +44,9 @@ class Protocol:
     focal_error: float = 0.0
     """Error of the given focal length, as a share of the true one."""
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1 and p2 of the lens (OpenCV's model), of which the input says nothing."""
+    """k1, k2, p1 and p2 of the lens (OpenCV's model); they are not in the input."""
     mixed: bool = False
-    """Use faults per frame instead: see `_mixed`."""
+    """Choose a fault for each frame instead: see `_mixed`."""
     jpeg: int | None = None
     """JPEG quality; None for lossless PNG."""
     stretched: bool = False

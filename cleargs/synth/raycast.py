@@ -148,7 +148,7 @@ def _to_local(item: np.void, vector: ArrayF64, shift: bool, local: ArrayF64) -> 
 
 @njit(cache=True, error_model="numpy")
 def _cover_of_sphere(to_centre: ArrayF64, radius: float, to_light: ArrayF64, reach: float) -> float:
-    """Return the share of the lamp, 0 to 1, that a ball hides from a point, with a soft edge."""
+    """Return the share of the lamp, 0 to 1, that a ball hides from a point; the lamp is at ``reach`` m."""
     along = _dot(to_centre, to_light)
     if along <= 0.0 or along >= reach:
         return 0.0
@@ -303,7 +303,7 @@ def _render(
     states: ArrayF64,  # [S, H, M, 4] centre and brightness of the last M primitives; M = 0: nothing moves
     image: ArrayF64,
     depth: ArrayF64,
-    share: ArrayF64,  # [H, W] share of the samples that see one of them in another state than at rest
+    share: ArrayF64,  # [H, W] share of the samples that see one of these moved, or with another brightness
 ) -> None:
     """Add the mean of the samples to ``image`` [H, W, 3], ``depth`` [H, W] (camera z) and ``share``."""
     passes, height, width = poses.shape[0], image.shape[0], image.shape[1]
@@ -347,7 +347,7 @@ class RoomWorld:
     room: Room
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
-        """Return the mean of the samples [H, W, 3] in linear light. Each has its jitter inside the pixel."""
+        """Return the mean [H, W, 3] in linear light of samples at different points inside each pixel."""
         return self._expose(shutter, lens, aperture)[0]
 
     def film(

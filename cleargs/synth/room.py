@@ -99,7 +99,7 @@ PRIMITIVE = np.dtype(
         ("texture", np.int64),
         ("gloss", np.float64),  # strength of the highlight, 0 for a matt surface
         ("bound", np.float64),  # radius of the bounding sphere
-        # Radius of the ball that stands for it in ambient occlusion; 0: it casts no shadow.
+        # Radius of the ball that replaces the primitive in ambient occlusion; 0: it casts no shadow.
         ("shade", np.float64),
     ]
 )
@@ -179,7 +179,7 @@ def make_room(seed: int) -> Room:
         radius = rng.uniform(0.07, 0.12)
         centre = (table[0] + rng.uniform(-0.55, 0.55), 0.75 + radius, table[2] + rng.uniform(-0.25, 0.3))
         items.append(primitive(SPHERE, centre, (radius, 0, 0), material(), gloss=0.8))
-    for side in (-1.0, 1.0):  # a cupboard and a shelf on either side of it
+    for side in (-1.0, 1.0):  # a cupboard and a shelf on either side of the table
         half = (rng.uniform(0.25, 0.4), rng.uniform(0.45, 0.8), rng.uniform(0.2, 0.3))
         centre = (side * rng.uniform(1.5, 1.9), half[1], -DEPTH / 2 + half[2] + rng.uniform(0.02, 0.4))
         items.append(primitive(BOX, centre, half, material(), yaw=rng.uniform(-0.3, 0.3)))

@@ -33,8 +33,8 @@ def first_line(error: Exception) -> str:
 def declare_torchvision_operators() -> None:
     """Declare two operators that torchvision needs for its import with a CPU build of torch.
 
-    Its released build registers shapes for two detection operators. Its library defines them, but does not
-    load with such a torch. No converted network calls them.
+    torchvision registers shapes for two detection operators. Its compiled library, which defines them, does
+    not load with such a torch. No converted network calls them.
     """
     for name in ("nms", "qnms"):
         if not hasattr(torch.ops.torchvision, name):

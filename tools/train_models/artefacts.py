@@ -1,7 +1,7 @@
 """Simulated artefacts of sharpening, restoration and splatting on photos.
 
-They complement the blur, noise and JPEG of ``degrade`` for training the no-reference scorer. RIVR uses it to
-rank renders of a Gaussian scene, restored frames and fusions of the two.
+With the blur, noise and JPEG of ``degrade``, they train the no-reference scorer. RIVR uses the scorer to rank
+renders of a Gaussian scene, restored frames and fusions of the two.
 
 Inputs and outputs are images [H, W, 3], float32 sRGB in [0, 1]. All random choices come from ``rng``.
 """

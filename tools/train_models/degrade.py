@@ -75,7 +75,7 @@ def rasterise_path(path: NDArray[np.float64], length: float) -> Kernel:
 def motion_kernel(rng: np.random.Generator, length: float, line_share: float = 0.4) -> Kernel:
     """Return a random motion kernel of ``length`` px (largest distance between two of its points).
 
-    It is straight with probability ``line_share``, else that of a shaking hand.
+    It is straight with probability ``line_share``, else the path of a shaking hand.
     """
     path = line_path(rng) if rng.random() < line_share else handheld_path(rng)
     return rasterise_path(path, length)

@@ -1,9 +1,9 @@
-"""Agreement of the embedded scorers with LPIPS on held-out photo sources.
+"""Measure how well the embedded scorers agree with LPIPS on held-out photo sources.
 
     python -m tools.train_models.evaluate_scorer --photos DIR
 
-It uses whole photos, reduced by a third, with each artefact once. It needs the LPIPS weights (`cleargs
-models install lpips`).
+The photos are whole, reduced by a third, with each artefact once. The script needs the LPIPS weights
+(`cleargs models install lpips`).
 """
 
 from __future__ import annotations

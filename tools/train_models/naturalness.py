@@ -2,9 +2,9 @@
 
     python -m tools.train_models.naturalness --work DIR --out cleargs/models/naturalness.toml
 
-Ridge regression of LPIPS on the terms of the quadratic. Differences to the clean version of the same content
-count in addition to the values, because RIVR only compares versions of one content. The features take
-minutes, the fit seconds.
+The fit is a ridge regression of LPIPS on the terms of a quadratic. It also fits the differences to the clean
+version of the same content, because RIVR only compares versions of one content. The features take minutes,
+the fit seconds.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ BATCH = 8
 LEARNING_RATE = 1e-3
 WARM_UP = 300
 DECAY_SHARE = 0.4
-"""Last share of the steps, in which the learning rate falls to zero along a half cosine."""
+"""Share of the steps, at the end, in which the learning rate falls to zero along a half cosine."""
 
 CLIP_NORM = 0.2
 """Maximum norm of the gradient."""
@@ -196,7 +196,7 @@ def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[ImageF32,
 def _cut(images: Sequence[ImageU8], scale: float, rng: np.random.Generator) -> ImageF32:
     """Return a patch with margin, shrunk by ``scale``, rotated and mirrored at random.
 
-    It is the one with more detail at two random places.
+    It is the one with more detail among the patches at two random places.
     """
     image = images[int(rng.integers(len(images)))]
     size = PATCH + 2 * MARGIN

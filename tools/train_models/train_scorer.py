@@ -142,7 +142,7 @@ def train(
 
     Args:
         pairs: Training pairs.
-        seconds: Time limit. The learning rate follows the time if it ends before ``epochs``.
+        seconds: Time limit. The learning rate follows the time if the limit comes before ``epochs``.
         epochs: Maximum number of epochs.
         seed: Seed of initial weights and batches.
         checkpoint: File to which the averaged weights are saved regularly.
@@ -192,10 +192,10 @@ def _loss(
     predicted: Tensor,  # [G, V]
     targets: Tensor,  # [G, V]
 ) -> Tensor:
-    """Return smooth L1 plus logistic losses on the order of pairs.
+    """Return a smooth L1 loss plus two logistic losses on the order of pairs.
 
-    One covers pairs of versions of one content, the other all pairs of the batch, weighted by the difference
-    of their targets.
+    One is over pairs of versions of one content, the other over all pairs of the batch, weighted by the
+    difference of their targets.
     """
     regression = functional.smooth_l1_loss(predicted, targets, beta=0.05)
     within = (targets[:, :, None] - targets[:, None, :] > _TOLERANCE).float()

@@ -43,7 +43,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """See `Layout.open_capture`. Images without a pose are frames too: they stay in the table, marked."""
+    """See `Layout.open_capture`. Images without a pose are frames too: the table has them, unregistered."""
     from cleargs.capture.model import read_model
 
     models, folder = _models(source), _largest(source)
@@ -110,12 +110,12 @@ def _largest(root: Path) -> Path:
 
 
 def _number_of_images(file: Path) -> int:
-    """Return how many images a model's ``images.bin`` or ``images.txt`` states; 0 where it is damaged."""
+    """Return the number of images in ``file``, ``images.bin`` or ``images.txt``; 0 if it is damaged."""
     try:
         if file.suffix == ".bin":
             with open_regular(file) as opened:
                 return int(struct.unpack("<Q", opened.read(8))[0])
         lines = [line for line in read_text(file).splitlines() if not line.startswith("#")]
-        return sum(bool(line.strip()) for line in lines[::2])  # each has a second line, of its keypoints
+        return sum(bool(line.strip()) for line in lines[::2])  # the second line of each has its keypoints
     except FAULTS:
         return 0

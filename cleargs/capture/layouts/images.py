@@ -1,4 +1,4 @@
-"""A folder of images and nothing else."""
+"""A folder of images without poses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """See `Layout.open_capture`; in the order of `frame_key`."""
+    """See `Layout.open_capture`. The frames are in the order of `frame_key`."""
     folder = _images_of(source)
     files = sorted(image_files(folder), key=lambda path: frame_key(path.name))
     if not files:
@@ -44,7 +44,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
 
 
 def _images_of(root: Path) -> Path:
-    """Return the folder with the images; a folder of any name where the usual ones have none."""
+    """Return the folder with the images. It may have any name if the usual folders have no images."""
     if (folder := folder_of_images(root)) is not None:
         return folder
     others = [folder for folder in folders_to_search(root) if image_files(folder)] if root.is_dir() else []

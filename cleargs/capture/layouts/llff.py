@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, TokenError)
-"""NumPy lets errors of Python's tokenizer through where the header is damaged."""
+"""`FAULTS`, and the errors of Python's tokenizer that NumPy raises for a damaged header."""
 
 POSES_BOUNDS = "poses_bounds.npy"
 """LLFF's file of poses."""
@@ -37,7 +37,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """See `Layout.open_capture`.
 
-    Frames have the order of the rows, because these data sets hold every N-th row out.
+    Frames have the order of the rows, because users of these data sets hold out every N-th row.
     """
     frames = read_llff(source)
     return Capture("llff", chosen(frames, source, config.max_frames), len(frames))
@@ -75,7 +75,7 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
     with faults_as(InputError, f"cannot read {path}", hint=hint, faults=_FAULTS):
         open_regular(path).close()
         # Mapped, so that a damaged header cannot ask for more memory than the file has bytes.
-        with warnings.catch_warnings(action="ignore"):  # Python 2 wrote some
+        with warnings.catch_warnings(action="ignore"):  # about headers that Python 2 wrote
             table = np.lib.format.open_memmap(path, mode="r")
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
             raise ValueError(f"it holds {table.dtype} of shape {table.shape}, not numbers of shape (N, 17)")

@@ -42,11 +42,11 @@ class _Entry(NamedTuple):
 
 _LISTING = "transforms.json"
 _SPLIT = tuple(f"transforms_{part}.json" for part in ("train", "test", "val"))
-"""Blender's form: a file per part. The frames of test, or without that file those of val, are held out."""
+"""Blender's form: a file per part. The frames of test (of val if there is no test) are held out."""
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `Layout.detect`: it lists images, with or without poses."""
+    """See `Layout.detect`. Even without ``poses`` the file counts, because it lists images."""
     return bool(_listings(source))
 
 
@@ -92,9 +92,9 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
     """Return the frames that ``path`` lists, in its order; without ``poses``, only their images.
 
     A frame's name is its ``file_path`` as listed, with the extension of the file found. Further entries, such
-    as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``, are passed over.
-    ``notes`` receives a note on missing images, which are left out. None: they are an error. Raises
-    InputError for damaged JSON, most images missing, missing or NaN poses, and unknown cameras.
+    as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``, are ignored. ``notes``
+    receives a note on missing images, which are left out; if it is None, they are an error. Raises InputError
+    for damaged JSON, if most images are missing, for missing or NaN poses, and for unknown cameras.
     """
     common, entries = _read_listing(path)
     missing = [entry.values["file_path"] for entry in entries if entry.image is None]
@@ -105,7 +105,7 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
     for entry in entries:
         if entry.image is None:
             continue
-        # The ending may be left out, dots in the name are none, and Windows has other slashes.
+        # A listed name may have no extension, may have dots, and has backslashes on Windows.
         name = Path(entry.values["file_path"].replace("\\", "/")).with_name(entry.image.name).as_posix()
         if entry.mask is None and "mask_path" in entry.values:
             raise InputError(
@@ -205,7 +205,7 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
 def _finder(root: Path) -> Callable[[str], Path | None]:
     """Return a function that finds the file that a listing in ``root`` names.
 
-    Else it finds the image of its stem there, or in another folder if there is none of that name.
+    If the file is missing, it finds the image with this stem there, or in others if the folder is missing.
     """
 
     @cache
@@ -218,7 +218,7 @@ def _finder(root: Path) -> Callable[[str], Path | None]:
         path = root / listed.replace("\\", "/")
         if path.is_file():
             return path
-        # A listed name may have no ending, another ending, or lack a second one.
+        # A listed name may have no extension, another one, or a dot that starts none.
         stems = path.name.lower(), path.stem.lower()
         folders = [path.parent] if path.parent.is_dir() else others()
         found = (by_stem(folder).get(stem) for folder in folders for stem in stems)

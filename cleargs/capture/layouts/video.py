@@ -1,4 +1,4 @@
-"""Videos: frames evenly in time, of one or of all videos in a folder."""
+"""Videos: frames evenly spaced in time, of one video or of all videos in a folder."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """See `Layout.open_capture`. Each video gets frames by its share of the time."""
+    """See `Layout.open_capture`. Each video gets frames in proportion to its length."""
     from cleargs.media.video import read_timeline
 
     videos = _videos(source)
@@ -69,7 +69,7 @@ def video_frame(source: Path, timeline: Timeline, index: int, prefix: str) -> So
 def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[int]:
     """Return frame numbers evenly in time (not in number: the frame rate may vary).
 
-    They are 1 / ``fps`` seconds apart if that is given, and at most ``at_most`` from first to last.
+    They are 1 / ``fps`` seconds apart if that is given. At most ``at_most`` are chosen, from first to last.
     """
     import numpy as np
 
@@ -86,9 +86,9 @@ def _videos(source: Path) -> list[Path]:
 
 
 def _shares(timelines: Sequence[Timeline], at_most: int) -> list[int]:
-    """Share ``at_most`` frames out by the length of each video, by largest remainders."""
+    """Divide ``at_most`` frames among the videos in proportion to their lengths, by largest remainders."""
     spans = [timeline.seconds(-1) - timeline.seconds(0) if timeline.pts else 0.0 for timeline in timelines]
-    if not any(spans):  # single frames
+    if not any(spans):  # each has a single frame
         spans = [float(bool(timeline.pts)) for timeline in timelines]
     wanted = [at_most * span / sum(spans) for span in spans]
     shares = [int(share) for share in wanted]
@@ -112,7 +112,7 @@ def _notes(videos: Sequence[Path], timelines: Sequence[Timeline]) -> list[str]:
 
 
 def _nearest(times: ArrayF64, wanted: ArrayF64) -> list[int]:
-    """Numbers of the frames nearest to the wanted times, each once; ``times`` start at 0 and ascend."""
+    """Return the numbers of the frames nearest to ``wanted``, each once. ``times`` ascend from 0."""
     import numpy as np
 
     after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)

@@ -33,7 +33,7 @@ def _cgroup_headroom(root: Path) -> Iterator[int]:
             mount, limit, usage = root / "sys/fs/cgroup/memory", "limit_in_bytes", "usage_in_bytes"
         else:
             continue
-        # A container may see its own group as the mount point, while the path is the one outside.
+        # In a container, the mount point can be the container's group, while the path is that on the host.
         own = Path(path.lstrip("/"))
         for group in (own, *own.parents):
             allowed, used = (_read(mount / group / f"memory.{name}").strip() for name in (limit, usage))

@@ -48,7 +48,7 @@ def view_numbers(camera: Camera) -> list[float]:
     """Return a camera as the 23 numbers that the kernels read.
 
     They are the rows of the world-to-camera rotation, its translation, the camera's centre in the world, fx,
-    fy, cx and cy in px, and the bounds of x/z and y/z in the Jacobian (left, right, top, bottom; gsplat's).
+    fy, cx and cy in px, and gsplat's bounds of x/z and y/z in the Jacobian (left, right, top, bottom).
     """
     pose = camera.world_to_camera
     beyond_x = VIEW_CLAMP * 0.5 * camera.width / camera.fx

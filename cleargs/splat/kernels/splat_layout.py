@@ -6,7 +6,7 @@ projected covariance Σ and d = pixel centre - projected mean,
     ½ dᵀ Σ⁻¹ d = ½ [ a (dx - k dy)² + e dy² ],   a = Σyy / det Σ,   k = Σxy / Σyy,   e = 1 / Σyy,
 
 a sum of two non-negative terms. In float32, the usual A dx² + 2 B dx dy + C dy² loses its digits to
-cancellation on needles; this sum does not. The logarithm of alpha, to base 2, is then
+cancellation on thin ellipses; this sum does not. The logarithm of alpha, to base 2, is then
 
     log2 alpha = LOG2_OPACITY - BEND_X (dx - SKEW dy)² - BEND_Y dy²,
 

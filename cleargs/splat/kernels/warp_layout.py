@@ -12,13 +12,13 @@ CHANNELS = 4
 CURVE_LAST = 2.0
 CURVE_STEPS = 8192
 CURVE_DENSITY = CURVE_STEPS / CURVE_LAST
-"""The curves between sRGB and linear light are tables of `CURVE_STEPS` steps from 0 to `CURVE_LAST`, with
-straight lines between and beyond. They are within 2e-5 of the formulas, and their derivative is exact."""
+"""The curves between sRGB and linear light are tables of `CURVE_STEPS` steps from 0 to `CURVE_LAST`, linear
+between and beyond the steps. They are within 2e-5 of the formulas. Slopes are exactly those of the table."""
 
 MIN_COVERED = 0.5
 """A pixel has a depth if its alpha is above this."""
 MAX_NEARNESS = 4.0
-"""Largest nearness (median depth / depth) of a pixel: floaters near the lens would move by whole images."""
+"""Upper limit of a pixel's nearness (median depth / depth), which bounds the motion of nearby floaters."""
 
 # A frame's motion as the kernels read it: a row of float32, lengths in pixels of the observed image.
 FX = 0
@@ -29,7 +29,7 @@ MEDIAN = 4  # median depth, scene units
 DISC = 5  # radius of the defocus disc per unit of nearness
 FOCUS = 6  # nearness that is in focus
 TWISTS = 7  # pose, blur, skew, bend and cube: translation and rotation, six numbers each
-CURVES = 25  # the first number of bend; all are zero on a straight path
+CURVES = 25  # first number of bend; bend and cube are zero on a straight path
 MOTION_COLUMNS = 37
 
 BEND_REACH = 1.0 / 6.0
@@ -40,7 +40,7 @@ CUBE_REACH = 1.0 / 20.0
 class DisplacementFields(NamedTuple):
     """Displacements of an observed image's pixels in px, x before y; ``frame_warp`` has the formula."""
 
-    offset: Tensor  # [2, H, W] at the middle of the exposure
+    offset: Tensor  # [2, H, W] mean over the exposure
     sweep: Tensor  # [2, H, W] over the exposure, by the part of the path that is linear in time
     radius: Tensor  # [H, W] of the defocus disc
     reach: float | None = None

@@ -18,7 +18,7 @@ from cleargs.types import AnyArray, ArrayF32
 TERMS = 8
 """The regressors 1, R, R_x, R_y, R_xx / 2, R_xy, R_yy / 2, and the photograph."""
 
-_DARK = np.float32(0.02)  # linear light below which noise no longer falls with the light
+_DARK = np.float32(0.02)  # linear light below which the noise no longer decreases with the light
 _HALF = np.float32(0.5)
 _QUARTER = np.float32(0.25)
 
@@ -30,12 +30,12 @@ def blur_sums(
     weight: ArrayF32,  # [H, W] 0 where a pixel does not count
     stride: int,  # distance of the rows and columns that are read, px
     tile: int,  # side of the tiles, px
-    sums: AnyArray,  # [R, 2, TERMS, TERMS] float64, written: R rows are read (lower triangles)
+    sums: AnyArray,  # [R, 2, TERMS, TERMS] float64, written: lower triangles for the R rows that are read
 ) -> None:
     """Write the products of the regressors, summed per row over the tiles of each colour of a checkerboard.
 
-    A pixel counts with its weight over its squared light, since the noise of a photograph is about in
-    proportion to its light after the sRGB curve.
+    The weight of a pixel is divided by its squared light: after the sRGB curve, the noise of a photograph is
+    about proportional to its light.
     """
     _, width = render.shape
     for k in prange(len(sums)):

@@ -38,7 +38,7 @@ def adam(
 ) -> None:
     """Update ``parameter`` [n] and its moments [n] in place by a step of Adam (Kingma and Ba 2015).
 
-    ``rates`` are the step sizes of one block, the work item, divided by 1 - beta1^t; they are the same for
+    ``rates`` are the learning rates of one block (a work item), divided by 1 - beta1^t. They are the same for
     every block. ``root_correction`` is sqrt(1 - beta2^t).
     """
     n, block = parameter.shape[0], rates.shape[0]

@@ -1,6 +1,6 @@
-"""Kernels of the search for a frame's motion: the misfit of a motion, and the equations of a step towards it.
+"""Kernels of the search for a frame's motion: its misfit (sum of differences), and a Gauss-Newton step.
 
-Images have one channel and no margin; ``frame_warp`` has the formula of the fields.
+Images have one channel and no margin. ``frame_warp`` has the formula of the fields.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _ONE = np.float32(1)
 
 @inlined
 def _mixed(plane: Any, i: Any, j: Any, a: Any, b: Any) -> Any:
-    """Return the value of ``plane`` [H, W] between four pixels, the first of which is (i, j)."""
+    """Interpolate ``plane`` [H, W] linearly between four pixels, of which column i, row j is the top left."""
     above = plane[j, i] + a * (plane[j, i + 1] - plane[j, i])
     below = plane[j + 1, i] + a * (plane[j + 1, i + 1] - plane[j + 1, i])
     return above + b * (below - above)
@@ -99,7 +99,7 @@ def misfits(
 @kernel
 def normal_equations(
     image: ArrayF32,  # [H, W]
-    smooth: ArrayF32,  # [H, W]: the image without its noise, which has the slopes
+    smooth: ArrayF32,  # [H, W]: the smoothed image, whose slopes are used
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
     basis: ArrayF32,  # [6, 2, H, W]: image motion per component of a twist, px
@@ -109,7 +109,7 @@ def normal_equations(
     curve: ArrayF32 | None,  # [4, H, W]
     times: ArrayF32,  # [K]
     outlier: float,
-    active: AnyArray,  # [A] int64: unknowns, of the 30 numbers of pose, blur, skew, bend and cube
+    active: AnyArray,  # [A] int64: unknowns, as indices of the 30 numbers of pose, blur, skew, bend and cube
     matrices: AnyArray,  # [H, A, A] float64, written
     sides: AnyArray,  # [H, A] float64, written
 ) -> None:

@@ -5,10 +5,10 @@ A pixel x of the observed image is the mean of the sharp image at
     x + offset(x) + t sweep(x) + (t^2 - 1/12) bend(x) + (t^3 - 3t/20) cube(x) + radius(x) (u, v)
 
 over ``samples`` (t, u, v): times t from -1/2 to 1/2 of the exposure, and points (u, v) of the unit disc. The
-polynomials are orthogonal over the exposure. ``curve`` [4, H, W] holds bend and cube. It is None where the
-paths are straight, for which Numba compiles the kernels without the terms.
-Fields are in pixels, [2, H, W] with x before y. The sharp image is larger than the observed image by
-``margin`` pixels on every side. Beyond its border, the border pixels are repeated.
+polynomials are orthogonal over the exposure. ``curve`` [4, H, W] holds bend and cube. It is None for straight
+paths; Numba then compiles the kernels without these terms. Fields are in pixels, [2, H, W] with x before y.
+The sharp image is larger than the observed image by ``margin`` pixels on every side. Beyond its border, the
+border pixels are repeated.
 
 Interpolation between pixels is linear. With a single sample (a rolling shutter without blur) it is cubic,
 because linear interpolation would blur a sharp frame.
@@ -61,25 +61,25 @@ def between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, f
 
 @inlined
 def bow(t: Any) -> Any:
-    """Return the polynomial of second order at a time of the exposure."""
+    """Return the polynomial of second order at time ``t`` of the exposure, from -1/2 to 1/2."""
     return t * t - np.float32(1.0 / 12.0)
 
 
 @inlined
 def ess(t: Any) -> Any:
-    """Return the polynomial of third order at a time of the exposure."""
+    """Return the polynomial of third order at time ``t`` of the exposure."""
     return t * (t * t - np.float32(3.0 / 20.0))
 
 
 @inlined
 def aside(t: Any, bend: Any, cube: Any) -> Any:
-    """Return the displacement from the straight path at a time of the exposure."""
+    """Return the displacement from the straight path at time ``t`` of the exposure, along one axis."""
     return bow(t) * bend + ess(t) * cube
 
 
 @inlined
 def _curved_reach(bend: Any, cube: Any) -> Any:  # float32 -> float32
-    """Return how far the curve leads a pixel from its straight path at most, px."""
+    """Return an upper bound of the distance between the curved and the straight path along an axis, px."""
     return np.float32(layout.BEND_REACH) * abs(bend) + np.float32(layout.CUBE_REACH) * abs(cube)
 
 
@@ -87,9 +87,9 @@ def _curved_reach(bend: Any, cube: Any) -> Any:  # float32 -> float32
 def _path(
     x: Any, y: Any, margin: Any, offset: Any, sweep: Any, radius: Any, curve: Any
 ) -> tuple[Any, Any, Any, Any]:
-    """Return the path of a pixel along each axis, and along both as pixels of `place_of`, and its disc.
+    """Return the path of a pixel along x, along y, along both (as pixels of `place_of`), and its disc radius.
 
-    A path is the place in the middle of the exposure, the sweep, the bend and the cube.
+    A path is a tuple: the mean place in the sharp image, the sweep, the bend and the cube, in px.
     """
     x0 = np.float32(x + margin) + offset[0, y, x]
     y0 = np.float32(y + margin) + offset[1, y, x]
@@ -115,7 +115,7 @@ def _inside(path: Any, wide: Any, last: Any) -> Any:  # 4 float32, float32, floa
 
 @inlined
 def _place_at(path: Any, disc: Any, t: Any, curve: Any) -> Any:
-    """Return the position in the sharp image of a pixel's sample at time ``t``, ``disc`` from the path."""
+    """Return the position in the sharp image of a sample at time ``t``, offset from the path by ``disc``."""
     place, sweep, bend, cube = path
     place = place + sweep * t + disc
     return place if curve is None else place + bend * bow(t) + cube * ess(t)
@@ -123,7 +123,7 @@ def _place_at(path: Any, disc: Any, t: Any, curve: Any) -> Any:
 
 @inlined
 def _along_axis(path: Any, disc: Any, t: Any, curve: Any) -> Any:
-    """Return one coordinate of that position, for a path along one axis."""
+    """Return one coordinate of the position of `_place_at`, for a path along one axis."""
     place, sweep, bend, cube = path
     place = place + t * sweep + disc
     return place if curve is None else place + aside(t, bend, cube)
@@ -164,7 +164,7 @@ def _twist(twists: Any, k: Any) -> Any:  # [5, 6] -> 6 float32
 
 @inlined
 def _flow(x: Any, y: Any, near: Any, twist: Any) -> tuple[Any, Any]:
-    """Return the displacement, in units of fx, of a pixel on the ray (x, y, 1) under a twist [6]."""
+    """Return the displacement of a pixel on the ray (x, y, 1) under a twist [6], px if fy is equal to fx."""
     tx, ty, tz, rx, ry, rz = twist
     along_x = near * (x * tz - tx) + x * y * rx - (_ONE + x * x) * ry + y * rz
     along_y = near * (y * tz - ty) + (_ONE + y * y) * rx - x * y * ry - x * rz
@@ -306,7 +306,7 @@ def spread(
     bands: ArrayF32,  # [bands, BAND + 2 reach, W + 2 margin, 4], written
     rows: int,
 ) -> None:
-    """Add the light of every observed pixel to the pixels that it sampled, one band per work item.
+    """Add the light of every observed pixel to the pixels that it sampled, one band of rows per work item.
 
     With `gather`, this is the transpose of `expose`. ``rows`` is the height of the sharp image. No vertical
     displacement is above ``reach`` - 3 pixels.

@@ -1,6 +1,6 @@
 """Pieces of a tile, the geometry of a splat in them, and the exponential function.
 
-The pixels of a tile are stored in a small buffer, divided into pieces: the LANES pixels of a row that form a
+The pixels of a tile are stored in a small buffer, divided into pieces: LANES pixels of a row, which form one
 vector. Piece 16 h + r is row r of the tile's h-th block of LANES columns. There is one block if a vector
 holds a whole row, else two. Only the pieces that the ellipse touches are visited; one pass finds them all.
 """
@@ -24,7 +24,7 @@ TOUCH_CUT = np.float32(constants.LOG2_ALPHA_CUT - 2e-3)
 PIECES = layout.TILE_PIXELS // LANES
 LAST_LANE = np.float32(LANES - 1)
 
-# Geometry of a batch's splats, stored after the pixel buffers: one value per tile row or column of each.
+# Geometry of a batch's splats, stored after the pixel buffers: per splat, one value per tile row or column.
 ROW_LOG2 = 0  # log2 alpha on the ridge of each row, [16]
 ROW_RIDGE = 16  # dx of the ridge of each row, [16]
 ROW_DY = 32  # dy of each row, [16]

@@ -8,7 +8,7 @@ is 1 initially, it computes
     colour += alpha T c,   depth += alpha T z,   T *= 1 - alpha
 
 and finally image = colour + T background. The backward pass goes from far to near. With g = dL/d(pixel),
-w = alpha T, and S = g · b, where b is the colour of all that is behind the splat, with nothing before it,
+w = alpha T, and S = g · b, where b is the colour behind the splat, as if nothing were in front of it,
 
     v = dL/d(ln alpha) = w (g · c - S),   0 where alpha is clamped,      S += alpha (g · c - S).
 
@@ -16,9 +16,9 @@ For each (tile, splat) pair, the gradients need only the sums of v, v u, v dy, v
 (``splat_layout.SUM_*``). ``gradients.backpropagate`` turns them into gradients once per Gaussian. Each pair
 has its own row of scratch, so there are no atomics, no races and no dependence on the number of threads.
 
-Only the pieces of a tile that a splat touches are visited (``pieces``). The geometry of a batch of splats is
-computed before any of them is blended. The loads of many splats then wait for memory together, and the pieces
-of a splat are known before the loop over them begins. Data of the next batch is prefetched meanwhile.
+Only the pieces of a tile (SIMD vectors of pixels: ``pieces``) that a splat touches are visited. The geometry
+of a batch of splats is computed before any of them is blended. The loads of many splats then wait for memory
+together, and the pieces of a splat are known before the loop over them begins. The next batch is prefetched.
 
 Depth is an optional fourth channel. If its array is None, Numba compiles the kernel without it.
 """
@@ -71,7 +71,7 @@ ALPHA_CUT = np.float32(constants.ALPHA_CUT)
 TRANSMITTANCE_STOP = np.float32(constants.TRANSMITTANCE_STOP)
 
 BATCH = 16
-"""Splats whose geometry is computed before they are blended. Pieces without a live pixel are then dropped."""
+"""Splats whose geometry is computed before they are blended. After a batch, finished pieces are dropped."""
 
 ALL_PIECES = np.int64(2**PIECES - 1)
 

@@ -75,7 +75,7 @@ def tile_columns(ellipse, row, width):
 
 @triton.jit
 def count_tiles(ellipse, visible, width, height):
-    """Return the number of tiles that each splat touches, int32. ``list_pairs`` writes as many."""
+    """Return the number of tiles that each splat touches, int32; must agree with ``list_pairs``."""
     rows = tile_rows(ellipse[1], ellipse[6], height)
     top, bottom = tl.where(visible, rows[0], 0), tl.where(visible, rows[1], 0)
     count = tl.zeros_like(top)

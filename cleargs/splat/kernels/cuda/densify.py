@@ -68,7 +68,7 @@ def refine(
 def add_noise(means, log_scales, rotations, logits, draws, amount, min_opacity, cut, n):
     """Add ``amount`` times the covariance times a normal vector, ``draws`` [N, 3], to the means [N, 3].
 
-    The noise fades out above ``min_opacity``. From the opacity ``cut`` on there is none.
+    The noise fades out above ``min_opacity``. Gaussians with an opacity of ``cut`` or more get none.
     """
     g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
     opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + g, mask=g < n, other=0.0).to(tl.float64)))

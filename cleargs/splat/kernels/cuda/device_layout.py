@@ -17,11 +17,11 @@ from cleargs.splat.constants import LOG2_ALPHA_CUT, SSIM_RADIUS, SSIM_SIGMA
 CHUNK = 64
 """Pairs between two checkpoints of the forward pass."""
 
-# Work of one program: numbers (Adam), pixels (colour), Gaussians or pairs.
+# Work of one program: numbers (Adam), Gaussians, pairs, or values of an image (loss).
 NUMBERS_BLOCK = 1024
 PROJECT_BLOCK = 128
 LIST_BLOCK = 32
-TOTAL_ROWS, TOTAL_BLOCK = 16, 16  # Gaussians, and pairs of each at a time
+TOTAL_ROWS, TOTAL_BLOCK = 16, 16  # Gaussians, and pairs of a Gaussian that are added at a time
 LOSS_ROWS, LOSS_COLUMNS = 4, 128  # rows of an image, and values in each
 
 # Planes of TILE_PIXELS values that the forward pass stores for each chunk.

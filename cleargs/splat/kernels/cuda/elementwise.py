@@ -70,9 +70,9 @@ def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
 
 
 def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
-    """Both gradients stay on the device."""
+    """Return both gradients on the device: see ``cleargs.splat.backend.Backend``."""
     colours = torch.nn.functional.pad(image.detach().double(), (0, 1), value=1.0)  # [H, W, 4]
-    # One channel at a time: torch sums in a fixed order, which a matrix product does not promise.
+    # One channel at a time: torch sums in a fixed order, which a matrix product does not guarantee.
     sums = [(grad_output[..., channel, None] * colours).sum(dim=(0, 1)) for channel in range(3)]
     return grad_output @ _on_device(affine, image)[:, :3], torch.stack(sums)
 

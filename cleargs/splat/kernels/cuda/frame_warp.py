@@ -1,9 +1,9 @@
 """Blur, rolling shutter and defocus as one warp, and its transpose.
 
 The mathematics is that of the CPU back end's ``frame_warp``. A lane is a pixel of the observed image, in both
-directions. Backward, each pixel adds its light to the places that it saw. Many pixels add to one place, in no
-fixed order. Light is therefore added in integer multiples of a small unit: their sum does not depend on the
-order, and the transpose gives the same bits each time.
+directions. In the transpose, each pixel adds its light to the pixels that it sampled. Many pixels add to the
+same one, in no fixed order. Light is therefore added in integer multiples of a small unit: the sum does not
+depend on the order, and the transpose gives the same bits each time.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
 BLOCK = 128
 
 SUM_BITS = 61
-"""Bits of the largest sum in one place. The shares of a cubic may make it 25/16 as large."""
+"""Bits of the largest sum in a pixel. The weights of cubic interpolation can make it 25/16 as large."""
 
 LEAST_LIGHT = 1e-18
-"""Lower bound of the brightest light, of which the unit is a share."""
+"""Lower limit of the brightest light. The unit of the sums is a fraction of the brightest light."""
 
 
 @triton.jit
@@ -36,7 +36,7 @@ def twist_of(motion, part):
 
 @triton.jit
 def flow(x, y, near, twist):
-    """Return the displacement, in units of fx, of a pixel on the ray (x, y, 1) under a twist."""
+    """Return the displacement of a pixel on the ray (x, y, 1) under a twist, px if fy is equal to fx."""
     tx, ty, tz, rx, ry, rz = twist
     along_x = near * (x * tz - tx) + x * y * rx - (1.0 + x * x) * ry + y * rz
     along_y = near * (y * tz - ty) + (1.0 + y * y) * rx - x * y * ry - x * rz
@@ -76,7 +76,7 @@ def displace(
     x = (column.to(tl.float32) + 0.5 - tl.load(motion + layout.CX)) / fx
     y = (row.to(tl.float32) + 0.5 - tl.load(motion + layout.CY)) / fy
     down = (row.to(tl.float32) + 0.5) / height - 0.5
-    # Pose and skew displace, blur sweeps.
+    # Pose and skew give the offset, blur gives the sweep.
     pose_x, pose_y = flow(x, y, near, twist_of(motion, 0))
     skew_x, skew_y = flow(x, y, near, twist_of(motion, 2))
     tl.store(offset + pixel, pose_x + down * skew_x, mask=inside)
@@ -95,7 +95,7 @@ def displace(
 
 @triton.jit
 def look(pixel, inside, offset, sweep, radius, height, width, margin):
-    """Return places that pixels see in the middle of the exposure, their sweeps, and their discs' radii."""
+    """Return the mean places that pixels sample, x and y, their sweeps, and the radii of their discs, px."""
     plane = height * width
     x = (pixel % width + margin).to(tl.float32) + tl.load(offset + pixel, mask=inside, other=0.0)
     y = (pixel // width + margin).to(tl.float32) + tl.load(offset + plane + pixel, mask=inside, other=0.0)
@@ -119,13 +119,13 @@ def curve_at(pixel, inside, curve, plane, CURVED: tl.constexpr):
 
 @triton.jit
 def aside(t, bend, cube):
-    """Return the displacement from the straight path at a time of the exposure."""
+    """Return the displacement from the straight path at time ``t`` of the exposure, along one axis."""
     return (t * t - 1.0 / 12.0) * bend + t * (t * t - 3.0 / 20.0) * cube
 
 
 @triton.jit
 def between(position, count):
-    """Return the first of the two pixels next to ``position``, of ``count``, and the share of the second."""
+    """Return the first of the two pixels around ``position``, of ``count``, and the weight of the second."""
     last = (count - 1).to(tl.float32)
     position = tl.minimum(tl.maximum(position, 0.0), last)
     first = tl.minimum(position, tl.maximum(last - 1.0, 0.0)).to(tl.int32)
@@ -134,10 +134,10 @@ def between(position, count):
 
 @triton.jit
 def shares(a, TAPS: tl.constexpr):
-    """Return the shares of the pixels around a place.
+    """Return the weights of the pixels around a position.
 
-    The place is ``a`` pixels behind the first of two, or the second of four. The four shares are those of
-    Keys, "Cubic convolution interpolation for digital image processing" (1981), with -1/2.
+    It is ``a`` pixels after the first of two, or the second of four. The four weights are those of Keys,
+    "Cubic convolution interpolation for digital image processing" (1981), with the parameter -1/2.
     """
     b = 1.0 - a
     if TAPS == 2:
@@ -149,7 +149,7 @@ def shares(a, TAPS: tl.constexpr):
 
 @triton.jit
 def neighbour(first, tap: tl.constexpr, count, TAPS: tl.constexpr):
-    """Return the index of a pixel that has a share; outside the image, that of the nearest border pixel."""
+    """Return the index of a pixel that has a weight; outside the image, that of the nearest border pixel."""
     return tl.minimum(tl.maximum(first + (tap - (TAPS // 2 - 1)), 0), count - 1)
 
 
@@ -247,7 +247,7 @@ def return_light(
 
 @triton.jit(do_not_specialize=["pixels"])
 def follow_curve(image, curve, out, slope, pixels, FROM: tl.constexpr, TO: tl.constexpr, BLOCK: tl.constexpr):
-    """Store an image [pixels, FROM] through a curve, [pixels, TO], and the curve's slope [pixels, 3]."""
+    """Map an image [pixels, FROM] through a curve to [pixels, TO]; store the curve's slopes [pixels, 3]."""
     pixel = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))[:, None]
     channel = tl.arange(0, layout.CHANNELS)[None, :]
     coloured = (pixel < pixels) & (channel < 3)
@@ -324,7 +324,7 @@ def _planes(fields: DisplacementFields) -> tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def _taps(samples: Tensor) -> int:
-    """Return the number of pixels with a share of a place, along one axis."""
+    """Return the number of pixels between which a sample is interpolated, along one axis."""
     return 4 if len(samples) == 1 else 2
 
 

@@ -28,7 +28,7 @@ from cleargs.splat.kernels.cuda.projection import (
 
 @triton.jit(do_not_specialize=["n"])
 def total(tile_counts, pair_starts, pair_sums, totals, n, COLUMNS: tl.constexpr):
-    """Sum each Gaussian's slots in float64, in their order, a block at a time: ``totals`` [COLUMNS, N]."""
+    """Add each Gaussian's pair sums in float64, in the order of the slots: ``totals`` [COLUMNS, N]."""
     g = tl.program_id(0) * device_layout.TOTAL_ROWS + tl.arange(0, device_layout.TOTAL_ROWS)
     mask = g < n
     count = tl.load(tile_counts + g, mask=mask, other=0)
@@ -158,7 +158,7 @@ def backpropagate(
         value = (by_quaternion[i] - along * quaternion[i]) / norm
         tl.store(grad_rotations + g * 4 + i, tl.where(some, value, 0.0).to(tl.float32), mask=mask)
 
-    # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 alike
+    # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 is analogous
     r0 = combine(1.0, combine(v0[0], axis0, v0[1], axis1), v0[2], axis2)
     r1 = combine(1.0, combine(v1[0], axis0, v1[1], axis1), v1[2], axis2)
     w0 = view_triple(view, device_layout.VIEW_ROTATION)

@@ -2,9 +2,9 @@
 
 The mathematics is that of the CPU back end's ``loss``. The 11 x 11 window of SSIM is separable.
 ``window_rows`` sums x, y, x², y² and xy along the rows. ``measure`` sums the results along the columns, which
-gives the similarity and its derivatives by the window means. ``window_maps`` and ``differentiate`` go the
-same way with the derivatives. An image row is 3 W interleaved values, so that neighbours in a channel are
-three values apart. Masked pixels are zero in both images, as are pixels outside the image.
+gives the similarity and its derivatives by the window means. ``window_maps`` and ``differentiate`` do the
+same with the derivatives. An image row is 3 W interleaved values, so that neighbours in a channel are three
+values apart. Masked pixels are zero in both images, as are pixels outside the image.
 
 Each program stores its sums in float64 at a separate place. torch adds them in a fixed order.
 """
@@ -24,7 +24,7 @@ from cleargs.splat.kernels.cuda.support import memory_errors
 
 @triton.jit
 def places(height, length):
-    """Return the rows and the places in them that a program handles, and which are inside the image."""
+    """Return the rows and the places in them that a program handles, and the mask of those in the image."""
     y = tl.program_id(1) * device_layout.LOSS_ROWS + tl.arange(0, device_layout.LOSS_ROWS)[:, None]
     i = tl.program_id(0) * device_layout.LOSS_COLUMNS + tl.arange(0, device_layout.LOSS_COLUMNS)[None, :]
     return y, i, (y < height) & (i < length)

@@ -23,7 +23,7 @@ from cleargs.splat.kernels.cuda import device_layout
 
 @triton.jit
 def pixels_of(tile, width, height):
-    """Return the numbers of a tile's pixels in the tile and in the image, which are inside, and x and y."""
+    """Return each pixel's number in the tile and in the image, the mask of those inside, and x and y, px."""
     tiles_x = (width + layout.TILE - 1) // layout.TILE
     pixel = tl.arange(0, layout.TILE_PIXELS)
     column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
@@ -160,7 +160,7 @@ def behind(
     HAS_DEPTH: tl.constexpr,
     PLANES: tl.constexpr,
 ):
-    """Store S, g · all that is behind, for every chunk of a tile that contributes: [C, 256]."""
+    """Store S, the part of g · pixel behind the chunk, for every chunk that contributes: [C, 256]."""
     tile = tl.program_id(0)
     pixel, at, inside, _, _ = pixels_of(tile, width, height)
     red = tl.load(grad_image + at * 3, mask=inside, other=0.0)

@@ -1,7 +1,7 @@
 """Compare the GPU's kernels with the CPU's on this machine.
 
 ``cleargs.gpu`` runs this module in a child process and reads its lines of JSON from stdout. Every check runs
-twice on the GPU, with the same bits, and once on the CPU, within the tolerances of ``tests/gpu``.
+twice on the GPU, which must give the same bits, and once on the CPU, with the tolerances of ``tests/gpu``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class View(NamedTuple):
     faint: bool = False
     """True: opacities near 0.02, so that a ray passes hundreds of Gaussians."""
     all_outputs: bool = False
-    """True: with anti-aliasing, alpha, depth, and spherical harmonics of degree 1 instead of 3."""
+    """True: with anti-aliasing, depth, gradients of alpha and depth, and SH of degree 1 instead of 3."""
 
     def scene(self, device: torch.device) -> tuple[Gaussians, Camera]:
         """Return the Gaussians on ``device``, and the camera."""
@@ -67,7 +67,7 @@ FULL = Sizes(
 )
 
 Rule = Callable[[Tensor, Tensor], str | None]
-"""Compares a result with the CPU's; returns what is wrong, or None."""
+"""Function of a result and the CPU's result that returns a description of the fault, or None."""
 Results = dict[str, tuple[Tensor, Rule]]
 Run = Callable[[Backend, torch.device], Results]
 
@@ -84,7 +84,7 @@ def within(limit: float, *, relative: bool = False) -> Rule:
 
 
 def as_image(found: Tensor, expected: Tensor) -> str | None:
-    """Compare images [H, W, ...]: in few pixels an alpha is on the other side of the cut 1/255."""
+    """Compare images [H, W, ...]. A few pixels may differ, since rounding can move an alpha across 1/255."""
     apart = (found - expected).abs().reshape(*found.shape[:2], -1).amax(dim=2)
     share, most = float((apart > 1e-5).double().mean()), float(apart.max())
     return (
@@ -93,7 +93,7 @@ def as_image(found: Tensor, expected: Tensor) -> str | None:
 
 
 def as_gradient(found: Tensor, expected: Tensor) -> str | None:
-    """Compare gradients: their difference has at most 1e-3 of their norm."""
+    """Compare gradients: the norm of the difference is at most 1e-3 of their norm."""
     error = float((found - expected).double().norm() / expected.double().norm().clamp(min=1e-30))
     return f"differs by {error:.2g} of its norm" if error > 1e-3 else None
 
@@ -198,7 +198,7 @@ def refinement(count: int, backend: Backend, device: torch.device) -> Results:
         gaussians, _ = View(number, 64, 48).scene(device)
         gaussians.logit_opacities[:] = torch.linspace(-8.0, 3.0, number).to(device)
         errors = torch.linspace(0.0, 1.0, number).to(device)
-        if not drawn:  # There is a place for each half of these two: no draw decides.
+        if not drawn:  # There is room to split both of these Gaussians, so draws do not matter.
             errors[:] = 0.0
             errors[[20, 33]] = 2.0
         grown, _ = backend.refine(

@@ -34,7 +34,7 @@ def require(device: torch.device) -> None:
 
 
 def available_memory(device: torch.device) -> int:
-    """Return the free bytes on ``device``, with those that torch reserves and does not use."""
+    """Return the free bytes on ``device``, including those that torch has reserved but does not use."""
     if device.type != "cuda":  # tensors of the interpreter
         return memory.available_memory()
     free, _ = torch.cuda.mem_get_info(device)
