@@ -47,7 +47,7 @@ _initialise_storage: Any = models.PrimitiveModel.__init__
 _declare: Any = cgutils.get_or_insert_function
 
 # The flags of jit.FAST.
-_FLAGS = ("contract", "nsz", "arcp")
+FLAGS = ("contract", "nsz", "arcp")
 # For minimum and maximum, whose arguments are never NaN.
 _NO_NAN = ("nnan", "nsz")
 
@@ -72,7 +72,9 @@ lanes = _VectorType(f"f32x{LANES}")
 mask = _MaskType(f"mask{LANES}")
 
 
-def _register_type(numba_type: type, llvm_type: ir.Type) -> None:
+def register_type(numba_type: type, llvm_type: ir.Type) -> None:
+    """Define how Numba stores values of a type."""
+
     class Model(models.PrimitiveModel):
         def __init__(self, manager: Any, front_end_type: Any) -> None:
             _initialise_storage(self, manager, front_end_type, llvm_type)
@@ -80,11 +82,12 @@ def _register_type(numba_type: type, llvm_type: ir.Type) -> None:
     _register_model(numba_type)(Model)
 
 
-_register_type(_VectorType, _VECTOR)
-_register_type(_MaskType, _MASK)
+register_type(_VectorType, _VECTOR)
+register_type(_MaskType, _MASK)
 
 
-def _broadcast_to(builder: Any, scalar: Any, vector: Any) -> Any:
+def broadcast_to(builder: Any, scalar: Any, vector: Any) -> Any:
+    """Return a value of the LLVM type ``vector`` with ``scalar`` in every lane."""
     undefined = ir.Constant(vector, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
     zeros = ir.Constant(ir.VectorType(_I32, vector.count), [0] * vector.count)
@@ -99,20 +102,20 @@ def _register_operator(
 
         def lower(context: Any, builder: Any, case: Any, values: Any) -> Any:
             vector = next(x.type for x in values if isinstance(x.type, ir.VectorType))
-            wide = (x if x.type == vector else _broadcast_to(builder, x, vector) for x in values)
+            wide = (x if x.type == vector else broadcast_to(builder, x, vector) for x in values)
             return emit(builder, *wide)
 
         _lower_builtin(function, *case.args)(lower)
 
 
-def _register_arithmetic(kind: Any) -> None:
+def register_arithmetic(kind: Any) -> None:
     """Define + - * / between values of ``kind``, and with float32 scalars on either side."""
     pairs = [(kind, kind), (kind, types.float32), (types.float32, kind)]
     operators = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
     for function, name in operators.items():
 
         def calculate(builder: Any, x: Any, y: Any, name: str = name) -> Any:
-            return getattr(builder, name)(x, y, flags=_FLAGS)
+            return getattr(builder, name)(x, y, flags=FLAGS)
 
         _register_operator(function, [_signature(kind, *pair) for pair in pairs], calculate)
 
@@ -128,16 +131,16 @@ def _register_comparisons() -> None:
         _register_operator(function, [_signature(mask, *pair) for pair in pairs], compare)
 
 
-_register_arithmetic(lanes)
+register_arithmetic(lanes)
 _register_comparisons()
 
 
-def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
-    compiled: Callable[..., Any] = numba_intrinsic(function)
-    return compiled
+def typed_intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``numba.extending.intrinsic`` of a function, with a declared type."""
+    return numba_intrinsic(function)
 
 
-def _operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator for a function that emits the code of an intrinsic for values of these kinds."""
 
     def decorate(emit: Callable[..., Any]) -> Callable[..., Any]:
@@ -145,7 +148,7 @@ def _operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Calla
         def typed(typing_context: Any, *values: Any) -> Any:
             return result(*kinds), lambda context, builder, sig, args: emit(builder, *args)
 
-        return _intrinsic(typed)
+        return typed_intrinsic(typed)
 
     return decorate
 
@@ -157,7 +160,9 @@ def _address(context: Any, builder: Any, sig: Any, args: Any, to: Any = _VECTOR)
     return builder.bitcast(builder.gep(data, [offset]), to.as_pointer())
 
 
-def _load(vector: Any) -> Callable[..., Any]:
+def loading(vector: Any) -> Callable[..., Any]:
+    """Return the code generator that loads the LLVM type ``vector`` from an array at an element offset."""
+
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value = builder.load(_address(context, builder, sig, args, vector))
         value.align = 4
@@ -166,13 +171,13 @@ def _load(vector: Any) -> Callable[..., Any]:
     return generate
 
 
-@_intrinsic
+@typed_intrinsic
 def load(typing_context: Any, array: Any, offset: Any) -> Any:
     """Load LANES consecutive elements of a float32 array from ``offset`` (in elements of the whole array)."""
-    return lanes(array, offset), _load(_VECTOR)
+    return lanes(array, offset), loading(_VECTOR)
 
 
-@_intrinsic
+@typed_intrinsic
 def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
     """Write lanes, a pixel or a pair of pixels to consecutive elements of a float32 array."""
 
@@ -195,31 +200,31 @@ def _prefetch(write: int) -> Callable[..., Any]:
     return generate
 
 
-@_intrinsic
+@typed_intrinsic
 def prefetch(typing_context: Any, array: Any, offset: Any) -> Any:
     """Prefetch the cache line of an element that will be read."""
     return types.void(array, offset), _prefetch(0)
 
 
-@_intrinsic
+@typed_intrinsic
 def prefetch_to_write(typing_context: Any, array: Any, offset: Any) -> Any:
     """Prefetch the cache line of an element that will be written."""
     return types.void(array, offset), _prefetch(1)
 
 
-@_operation(lanes, types.float32)
+@operation(lanes, types.float32)
 def broadcast(builder: Any, scalar: Any) -> Any:
     """Return a vector with the same float32 in every lane."""
-    return _broadcast_to(builder, scalar, _VECTOR)
+    return broadcast_to(builder, scalar, _VECTOR)
 
 
-@_operation(lanes)
+@operation(lanes)
 def lane_numbers(builder: Any) -> Any:
     """Return the lanes 0.0, 1.0, ... LANES - 1."""
     return ir.Constant(_VECTOR, [float(lane) for lane in range(LANES)])
 
 
-@_operation(lanes, mask, lanes, lanes)
+@operation(lanes, mask, lanes, lanes)
 def select(builder: Any, where: Any, yes: Any, no: Any) -> Any:
     """Return ``yes`` in lanes where the mask is set, and ``no`` in the others."""
     return builder.select(where, yes, no)
@@ -233,56 +238,56 @@ def _call(builder: Any, name: str, *args: Any, flags: tuple[str, ...] = ()) -> A
 
 # minimum and maximum call LLVM's functions because select(x < y, load p, y) followed by a store to p turns
 # into a masked store (vmaskmov). It is microcoded on AMD and nearly doubled the time of the forward pass.
-@_operation(lanes, lanes, lanes)
+@operation(lanes, lanes, lanes)
 def minimum(builder: Any, x: Any, y: Any) -> Any:
     """Return the lane-wise minimum; neither side may be NaN."""
     return _call(builder, "minnum", x, y, flags=_NO_NAN)
 
 
-@_operation(lanes, lanes, lanes)
+@operation(lanes, lanes, lanes)
 def maximum(builder: Any, x: Any, y: Any) -> Any:
     """Return the lane-wise maximum; neither side may be NaN."""
     return _call(builder, "maxnum", x, y, flags=_NO_NAN)
 
 
-@_operation(lanes, lanes)
+@operation(lanes, lanes)
 def magnitude(builder: Any, x: Any) -> Any:
     """Return |x|."""
     return _call(builder, "fabs", x)
 
 
-@_operation(lanes, lanes)
+@operation(lanes, lanes)
 def negative_magnitude(builder: Any, x: Any) -> Any:
     """Return -|x| by setting the sign bit."""
     bits = builder.bitcast(x, _INT_VECTOR)
     return builder.bitcast(builder.or_(bits, ir.Constant(_INT_VECTOR, [-(2**31)] * LANES)), _VECTOR)
 
 
-@_operation(types.boolean, mask)
+@operation(types.boolean, mask)
 def any_lane(builder: Any, where: Any) -> Any:
     """Return True if any lane is set."""
     return builder.icmp_unsigned("!=", builder.bitcast(where, _BITS), ir.Constant(_BITS, 0))
 
 
-@_operation(types.int64, mask)
+@operation(types.int64, mask)
 def mask_bits(builder: Any, where: Any) -> Any:
     """Return the mask as an int64, lane 0 in bit 0."""
     return builder.zext(builder.bitcast(where, _BITS), _I64)
 
 
-@_operation(types.int64, types.int64)
+@operation(types.int64, types.int64)
 def lowest_bit(builder: Any, bits: Any) -> Any:
     """Return the position of the lowest set bit of a non-zero int64."""
     return builder.cttz(bits, ir.Constant(_I1, 1))
 
 
-@_operation(types.float32, lanes)
+@operation(types.float32, lanes)
 def lane_sum(builder: Any, x: Any) -> Any:
     """Return the sum of all lanes."""
     function_type = ir.FunctionType(_F32, [_F32, _VECTOR])
     function = _declare(builder.module, function_type, f"llvm.vector.reduce.fadd.v{LANES}f32")
     # Without reassoc the lanes would be added one by one. No code around this call can change their order.
-    return builder.call(function, [ir.Constant(_F32, 0.0), x], fastmath=(*_FLAGS, "reassoc"))
+    return builder.call(function, [ir.Constant(_F32, 0.0), x], fastmath=(*FLAGS, "reassoc"))
 
 
 def _add_picked(builder: Any, x: Any, y: Any, left: list[int], right: list[int]) -> Any:
@@ -292,10 +297,10 @@ def _add_picked(builder: Any, x: Any, y: Any, left: list[int], right: list[int])
         kind = ir.VectorType(_I32, len(numbers))
         return builder.shuffle_vector(x, y, ir.Constant(kind, numbers))
 
-    return builder.fadd(pick(left), pick(right), flags=_FLAGS)
+    return builder.fadd(pick(left), pick(right), flags=FLAGS)
 
 
-@_intrinsic
+@typed_intrinsic
 def store_lane_sums(
     typing_context: Any,
     array: Any,
