@@ -1,12 +1,13 @@
-"""Array types that all packages share. Shapes are stated where an array is used."""
+"""Types that all packages share. Shapes of arrays are stated where an array is used."""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+Device: TypeAlias = Literal["cpu", "cuda"]
 ImageU8: TypeAlias = NDArray[np.uint8]
 """An 8-bit image: sRGB [H, W, 3], or grey [H, W]."""
 ImageF32: TypeAlias = NDArray[np.float32]

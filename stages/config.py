@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from cleargs.base_model import FrozenModel
-from cleargs.pipeline.stage import Device
 from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig, steps_from_frames
+from cleargs.types import Device
 
 G0_END, ROUNDS_END = 16 / 19, 18 / 19
 """Positions, from 0 to 1, in the schedule of all trainings: the ends of G0 and of RIVR's rounds."""

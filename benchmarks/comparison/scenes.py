@@ -27,12 +27,13 @@ from cleargs.manifest import Manifest, linked_manifest
 from cleargs.parquet import read_errors
 from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import RUN_FILE, Device, RunSpec, read_run_file
+from cleargs.pipeline.run_file import RUN_FILE, RunSpec, read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.safe_io import read_bytes, read_json
 from cleargs.splat.ply import read_ply
+from cleargs.types import Device
 
 EVALUATION_VERSION = 3
 """Version of the cache. Increase it when an evaluation of equal inputs gives other figures."""

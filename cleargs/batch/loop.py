@@ -28,7 +28,7 @@ from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import SCENE, Device, RunMetadata, RunSpec, read_metadata
+from cleargs.pipeline.run_file import SCENE, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
@@ -36,6 +36,7 @@ from cleargs.render import TARGETS
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
 from cleargs.subprocesses import module_command
+from cleargs.types import Device
 
 State = Literal["failed", "waiting", "partial", "done"]
 """``waiting``: stages are missing, and the last attempt, if any, reported no error."""

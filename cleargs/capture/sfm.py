@@ -208,7 +208,9 @@ def job_of(
     if poses is not None:
         owners: list[object] = [frame.camera for frame in frames]
     elif config.shared_camera:
-        owners = [(frame.width, frame.height, _lens_of(frame)) for frame in frames]
+        # Frames of one lens have the same video, or the same camera and focal length by EXIF.
+        lenses = [f.source.path if f.source.pts is not None else lens_name(f.source.path) for f in frames]
+        owners = [(frame.width, frame.height, lens) for frame, lens in zip(frames, lenses, strict=True)]
     else:
         owners = [frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
@@ -237,11 +239,6 @@ def job_of(
         seed=seed,
         threads=threads,
     )
-
-
-def _lens_of(frame: WorkFrame) -> object:
-    """Return what frames of one lens share: the video, or camera and focal length by EXIF."""
-    return frame.source.path if frame.source.pts is not None else lens_name(frame.source.path)
 
 
 def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:

@@ -28,8 +28,8 @@ from cleargs.cli.common import (
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.session import DeviceChoice, resolve_device
+from cleargs.types import Device
 
 
 @click.command(

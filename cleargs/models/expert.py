@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 
 from cleargs.errors import InputError, StageError
-from cleargs.models.onnx import Device, OnnxModel
+from cleargs.models.onnx import OnnxModel
 from cleargs.models.registry import Network, RegistryEntry, load_network
 from cleargs.models.tiling import map_tiled
-from cleargs.types import ImageF32
+from cleargs.types import Device, ImageF32
 
 
 class Expert(Network, Protocol):

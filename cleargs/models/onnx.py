@@ -15,16 +15,14 @@ from functools import cache
 from importlib.resources import files
 from io import StringIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from cleargs.errors import InputError, StageError
 from cleargs.plugins import installed_version
 from cleargs.safe_io import faults_as, read_bytes
-from cleargs.types import AnyArray, ArrayF32
-
-Device = Literal["cpu", "cuda"]
+from cleargs.types import AnyArray, ArrayF32, Device
 
 CUDA_PROVIDER = "CUDAExecutionProvider"
 

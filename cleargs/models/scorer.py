@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.models.naturalness import StatisticsScorer
-from cleargs.models.onnx import Device, OnnxModel
+from cleargs.models.onnx import OnnxModel
 from cleargs.models.registry import Network, RegistryEntry, find_model, load_network
 from cleargs.models.tiling import mean_over_tiles, require_scorable
-from cleargs.types import ImageF32
+from cleargs.types import Device, ImageF32
 
 CLARITY = "clarity-net"
 """The embedded network, trained for the primary role."""

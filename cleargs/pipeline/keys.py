@@ -14,8 +14,9 @@ from pydantic import BaseModel
 from cleargs.errors import listed
 from cleargs.manifest import KeyParts
 from cleargs.pipeline.settings import fields_of, flattened
-from cleargs.pipeline.stage import Device, Stage
+from cleargs.pipeline.stage import Stage
 from cleargs.plugins import ExtensionPoint, installed_version, package_of, plugins
+from cleargs.types import Device
 
 UPSTREAM_PREFIX = "of "
 """Prefix of a table in the key that holds the settings of another stage."""

@@ -12,8 +12,8 @@ from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_errors, write_bytes
 from cleargs.pipeline.config import Config, Document, check_document, known_settings, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.stage import Device as Device
 from cleargs.pipeline.store import STORE_FOLDER
+from cleargs.types import Device
 
 RUN_FILE = "run.toml"
 

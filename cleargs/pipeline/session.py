@@ -15,7 +15,6 @@ from cleargs.pipeline.config import check_document, known_settings, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
     RUN_FILE,
-    Device,
     RunMetadata,
     RunSpec,
     damaged_run_file,
@@ -24,6 +23,7 @@ from cleargs.pipeline.run_file import (
 )
 from cleargs.pipeline.store import STORE_FOLDER, Store
 from cleargs.progress import Reporter
+from cleargs.types import Device
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 

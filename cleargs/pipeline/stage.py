@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from pydantic import BaseModel
 
 from cleargs.files import External
 from cleargs.progress import Reporter
-
-Device: TypeAlias = Literal["cpu", "cuda"]
+from cleargs.types import Device
 
 C = TypeVar("C", bound=BaseModel, covariant=True)
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from cleargs.errors import InputError
 from cleargs.plugins import load_plugin
 from cleargs.rva.config import EVALUATORS, EvaluatorConfig, QwenConfig
 from cleargs.rva.evaluator import Evaluator
+from cleargs.types import Device
 
 if TYPE_CHECKING:
     from cleargs.rva.vlm.evaluator import QwenEvaluator
-
-Device = Literal["cpu", "cuda"]
 
 
 def check_evaluator(config: EvaluatorConfig) -> None:
