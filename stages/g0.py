@@ -8,9 +8,10 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig
+from cleargs.types import Device
 
 from .config import G0_END, TRAINED
 
@@ -50,7 +51,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 41
+VERSION = 42
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {

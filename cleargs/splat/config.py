@@ -8,9 +8,8 @@ from pydantic import Field, field_validator, model_validator
 
 from cleargs.base_model import FrozenModel, Unit
 
-# Numbers of steps and Gaussians if the settings leave them unset (measured in docs/experiments/training.md).
-# Steps follow the number of frames, so that each frame is seen often enough. Gaussians follow the number of
-# pixels, the information in a capture. `quality` scales both; docs/speed.md lists its cost and gain.
+# Steps and Gaussians if the settings leave them unset (docs/experiments/training.md): steps follow the number
+# of frames, Gaussians the number of pixels. `quality` scales both; docs/speed.md lists its cost and gain.
 Quality = Literal["draft", "standard", "high"]
 
 STEPS_PER_FRAME = 50
@@ -188,8 +187,6 @@ class TrainConfig(FrozenModel):
 
     coarse_factor: ClassVar[float] = 0.5
     """Factor on width and height of reduced images."""
-    growth: ClassVar[float] = 0.05
-    """Maximum growth per refinement, as a fraction of the number of Gaussians (3DGS-MCMC)."""
     min_opacity: ClassVar[float] = 0.005
     """Opacity up to which a Gaussian is dead (3DGS)."""
     lr_means_final: ClassVar[float] = 0.01
@@ -204,6 +201,11 @@ class TrainConfig(FrozenModel):
     def budget_for(self, pixels: int) -> int:
         """Return the maximum number of Gaussians for active frames with ``pixels`` pixels in total."""
         return self.budget or budget_from_pixels(pixels, self.max_budget, self.quality)
+
+    @property
+    def growth(self) -> float:
+        """Maximum growth per refinement (3DGS-MCMC: 0.05). 0.065 ends at twice the number of Gaussians."""
+        return 0.065 if self.quality == "high" else 0.05
 
     @property
     def length(self) -> int:
