@@ -21,7 +21,7 @@ class FinalDistilConfig(DistilConfig):
     """Settings of the final distillation (training on raw frames and repairs)."""
 
     begin: float = Field(
-        ROUNDS_END, ge=0, lt=1, description="share of the schedule that lies behind when this training begins"
+        ROUNDS_END, ge=0, lt=1, description="start of this training in the schedule, as a fraction"
     )
 
 

@@ -23,16 +23,16 @@ class G0Config(TrainConfig):
         G0_END,
         gt=0,
         le=1,
-        description="share of the schedule that lies behind when this training ends; RIVR and the "
-        "consolidation go on from there. 1: for a scene that nothing follows",
+        description="end of this training in the schedule, as a fraction; RIVR and the consolidation "
+        "continue from there. 1: for a scene that no other training continues",
     )
     sh_degree: int | None = Field(
         None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
     )
     exposure: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="one colour affine a frame; auto = on where the frames' gains on the points differ by "
-        "more than 5 %",
+        description="one colour affine per frame; auto = on if the brightness of the frames, measured at "
+        "the sparse points, spreads by more than 5 %",
     )
     antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
     min_points: int = Field(

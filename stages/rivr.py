@@ -31,10 +31,10 @@ class RoundsConfig(DistilConfig):
     """The distillations of RIVR's rounds, which follow each other in one part of the schedule."""
 
     begin: float = Field(
-        G0_END, ge=0, lt=1, description="share of the schedule that lies behind when the first round begins"
+        G0_END, ge=0, lt=1, description="start of the first round in the schedule, as a fraction"
     )
     end: float = Field(
-        ROUNDS_END, gt=0, le=1, description="share of the schedule that lies behind when the last round ends"
+        ROUNDS_END, gt=0, le=1, description="end of the last round in the schedule, as a fraction"
     )
 
 
@@ -66,17 +66,17 @@ class RivrConfig(FrozenModel):
     group: int | None = Field(
         None,
         ge=1,
-        description="most target frames that are repaired from one scene: a round goes along the trajectory "
-        "in groups, and what is accepted in one is distilled before the next is rendered (the paper's way); "
-        "unset = the whole round at once. The groups share the round's distil.steps",
+        description="maximum number of target frames that are repaired from one scene: a round has groups "
+        "along the trajectory, and the repairs of a group are distilled before the next one is rendered, as "
+        "in the paper; unset = one group. The groups share distil.steps of the round",
     )
     margin: float = Field(
         1.0, ge=0.0, le=100.0, description="primary scores this close to the best go to the tie-break scorer"
     )
     keep_raw: bool = Field(
         True,
-        description="a raw frame that needs no repair gets none and keeps supervising by itself; false: "
-        "the paper's, where every target gets a pseudo observation",
+        description="a raw frame that needs no repair is trained on as filmed; false: every target frame "
+        "gets a pseudo observation, as in the paper",
     )
     fuse_sigma: float = Field(
         2.0, gt=0.0, le=100.0, description="Gaussian that splits detail from base in the fusion, px"
@@ -86,13 +86,13 @@ class RivrConfig(FrozenModel):
     )
     undo_motion: bool = Field(
         True,
-        description="with use_observation: the raw frame loses the blur and the skew of the camera's motion, "
-        "found by comparing it with the render, before the expert restores it; false: the paper's",
+        description="with use_observation: undo the blur and the skew of the camera's motion in the raw "
+        "frame before the expert restores it; false: the expert restores the raw frame, as in the paper",
     )
     use_fused: bool = Field(
         False,
-        description="a third candidate, the render with the detail of what was restored; true: the paper's. "
-        "With undo_motion the restored frame has the render's detail already, and would have it twice",
+        description="a third candidate, as in the paper: the render with the detail of the restored frame. "
+        "With undo_motion the restored frame already has the render's detail; the fusion has it twice",
     )
     gate: GateConfig = Field(GateConfig(), description="limits beyond which a repair is refused")
     distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")

@@ -57,8 +57,8 @@ class SfmConfig(FrozenModel):
     )
     camera_model: SfmModel = Field(
         "auto",
-        description="COLMAP camera model that SfM fits; auto: SIMPLE_RADIAL, or OPENCV where that explains "
-        "matches better that took no part in fitting it",
+        description="COLMAP camera model that SfM fits; auto: SIMPLE_RADIAL, or OPENCV if that lowers the "
+        "error of matches that the fit did not use",
     )
     shared_camera: bool = Field(
         True, description="SfM: one camera for all frames of one size and lens; false: a camera per frame"

@@ -160,11 +160,11 @@ def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, report
         before, after = outcome.errors_px["given"], outcome.errors_px[outcome.method]
         what = "poses and cameras are adjusted to the images"
         if outcome.method == "sfm":
-            what = "poses and cameras are found again and laid over the given ones"
+            what = "poses and cameras are found again and aligned to the given ones"
         reporter.info(
             f"at the input's poses features missed their points by {missed:.1f} px (median): {what} "
-            f"({outcome.lens}), {found:.1f} px. Matches that took no part are off by {after:.2f} px, not "
-            f"{before:.2f}; a larger ingest.refine_above keeps the input's poses"
+            f"({outcome.lens}), {found:.1f} px. Matches that the fit did not use are off by "
+            f"{after:.2f} px, not {before:.2f}; a larger ingest.refine_above keeps the input's poses"
         )
     elif missed > config.refine_above:
         reporter.info(

@@ -61,7 +61,7 @@ MOVEMENT = pa.schema(
         column("moving_share", pa.float64(), "share of its cells that move"),
         column("rows", pa.int32(), "rows of cells, which divide the frame evenly"),
         column("columns", pa.int32(), "columns of cells"),
-        column("moves", pa.binary(), "a bit per cell, row by row, the first is the highest; 1: it moves"),
+        column("moves", pa.binary(), "a bit per cell, row by row, highest bit first; 1: the cell moves"),
     ]
 )
 """``movement.parquet``: the masks that a training used at its end. In other frames nothing moves."""

@@ -29,18 +29,18 @@ def _component(name: str, axis: str) -> pa.Field:
 FORMATION = pa.schema(
     [
         column("frame_id", pa.int32(), "active frame"),
-        column("draws", pa.int64(), "steps on the frame since its formation is looked for", nullable=True),
+        column("draws", pa.int64(), "steps since the first estimate of the formation", nullable=True),
         column("model", pa.string(), "none, blur, skew, both (blur and skew) or defocus"),
-        column("order", pa.int32(), "of the path in time: 1 straight, 2 quadratic, 3 cubic", nullable=True),
-        column("blur_px", pa.float64(), "mean length of the pixels' ways while they were exposed, px"),
+        column("order", pa.int32(), "order of the path: 1 straight, 2 quadratic, 3 cubic", nullable=True),
+        column("blur_px", pa.float64(), "mean length of the pixels' paths during the exposure, px"),
         column(
-            "skew_px", pa.float64(), "mean length of their ways from the first to the last row's exposure, px"
+            "skew_px", pa.float64(), "mean length of the paths from the first row's time to the last's, px"
         ),
         column("defocus_px", pa.float64(), "mean radius of the discs of defocus, px"),
-        column("reach_px", pa.float64(), "95 % of the pixels look less far from their place, px"),
-        column("explained", pa.float64(), "share of the frame's misfit that the model takes away"),
-        column("misfit", pa.float64(), "mean difference of high-passed linear luminance that is left"),
-        column("misfit_still", pa.float64(), "the same without the model"),
+        column("reach_px", pa.float64(), "distance from a pixel to what it shows: 95 % quantile, px"),
+        column("explained", pa.float64(), "share of the frame's misfit that the model removes"),
+        column("misfit", pa.float64(), "mean difference of high-passed linear luminance with the model"),
+        column("misfit_still", pa.float64(), "the same difference without the model"),
         column(
             "skew_gain",
             pa.float64(),
@@ -54,7 +54,7 @@ FORMATION = pa.schema(
             nullable=True,
         ),
         column("weight_before", pa.float64(), "RVA's weight of the frame"),
-        column("weight_after", pa.float64(), "with which it taught at the end"),
+        column("weight_after", pa.float64(), "weight of the frame at the end of the training"),
         *(_component(name, axis) for name in TWISTS for axis in AXES),
         column(
             "disc_px", pa.float64(), "radius of the disc of defocus per unit of nearness beyond the focus, px"

@@ -63,7 +63,7 @@ class FormationConfig(FrozenModel):
     )
     movement: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="leave regions out that move, that is, differ from the scene of the other frames; "
+        description="do not train on regions that move: they differ from the scene of the other frames; "
         "auto = where RVA finds something in front of the scene in a frame (ghosting of 0.3 or more)",
     )
 

@@ -109,11 +109,11 @@ def _read_header(file: BinaryIO) -> tuple[int, list[str], dict[str, str]]:
         raise ValueError("not a binary little endian PLY")
     elements = [line for line in lines if line[0] == "element"]
     if [line[:2] for line in elements] != [["element", "vertex"]] or len(elements[0]) != 3:
-        raise ValueError("it has elements other than vertices")
+        raise ValueError("the file has elements other than vertices")
     if not elements[0][2].isdecimal():
         raise ValueError(f"{elements[0][2]} is not a number of vertices")
     properties = [line for line in lines if line[0] == "property"]
     if any(len(line) != 3 or line[1] not in ("float", "float32") for line in properties):
-        raise ValueError("it has properties that are not float")
+        raise ValueError("the file has properties that are not float")
     comments = {" ".join(line[1:3]): " ".join(line[3:]) for line in lines if line[0] == "comment"}
     return int(elements[0][2]), [line[2] for line in properties], comments
