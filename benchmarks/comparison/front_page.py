@@ -80,7 +80,7 @@ def fault_table(found: Sequence[SavedSection]) -> str:
     if not rows:
         return ""
     head = ["synthetic rooms, by fault", "all frames alike", "ClearGS", "gain"]
-    texts = [[row.fault, _pair(row.before), _pair(row.after), gain_text(row.gain, 1)] for row in rows]
+    texts = [[row.fault, _pair(row.before), _pair(row.after), bold_difference(row.gain, 1)] for row in rows]
     saved = [one for one in found if one.section.name in SECTIONS]
     section = saved[0].section
     versions = " and ".join(dict.fromkeys(without_digest(one.version) for one in saved))
@@ -115,12 +115,12 @@ def _pair(means: tuple[float, float | None]) -> str:
     return f"{psnr:.1f} / {'-' if lpips is None else f'{lpips:.3f}'}"
 
 
-def gain_text(gain: Spread, digits: int) -> str:
-    """Return a gain with half its 95 % interval, in bold if the interval excludes 0."""
-    text = f"{gain.mean:+.{digits}f}"
-    if gain.half_width is not None:
-        text += f" ± {gain.half_width:.{digits}f}"
-    return f"**{text}**" if gain.excludes_zero else text
+def bold_difference(difference: Spread, digits: int) -> str:
+    """Return a difference with half its 95 % interval, in bold if the interval excludes 0."""
+    text = f"{difference.mean:+.{digits}f}"
+    if difference.half_width is not None:
+        text += f" ± {difference.half_width:.{digits}f}"
+    return f"**{text}**" if difference.excludes_zero else text
 
 
 def plot_gains(path: Path, rows: Sequence[FaultRow]) -> None:

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 
 from benchmarks.comparison.cells import Cell, Cells, Spread
 from benchmarks.comparison.findings import Comparison, compare_scenes
-from benchmarks.comparison.front_page import BASELINE, gain_text, has_block, with_block, without_digest
+from benchmarks.comparison.front_page import BASELINE, bold_difference, has_block, with_block, without_digest
 from benchmarks.comparison.pictures import find_image
 from benchmarks.comparison.scenes import Sample, SceneRecipe, evaluate_views, make_scenes
 from benchmarks.comparison.tables import Table
@@ -221,7 +221,7 @@ def real_table(listed: RealList, found: RealResults) -> str:
 
 def summary_table(listed: RealList, found: RealResults) -> str:
     """Return one row per scene, with the published figures of these scenes, as Markdown."""
-    head = ["real capture", "all frames alike", "ClearGS", "gain, dB", "processor minutes"]
+    head = ["real capture", "all frames alike", "ClearGS", "difference", "processor minutes"]
     rows, absent = [], []
     origins: dict[str, list[str]] = {}
     for scene in listed.scenes:
@@ -230,12 +230,17 @@ def summary_table(listed: RealList, found: RealResults) -> str:
             absent.append(scene.name)
             continue
         before, after = (found.cells.of("held-out", scene.name, name) for name in _COMPARED)
-        gain = found.cells.difference("held-out", scene.name, WHOLE, BASELINE, "psnr")
+        differences = (
+            found.cells.difference("held-out", scene.name, WHOLE, BASELINE, metric) for metric in REFINED
+        )
         rows.append(
             [
                 f"{scene.name}: {scene.shows}",
                 *(_short(found.cells, scene.name, name) for name in _COMPARED),
-                "-" if gain is None else gain_text(gain, 2),
+                " / ".join(
+                    "-" if one is None else bold_difference(one, digits)
+                    for one, digits in zip(differences, (2, 3), strict=True)
+                ),
                 f"{_minutes(before)} and {_minutes(after)}",
             ]
         )
@@ -248,7 +253,7 @@ def summary_table(listed: RealList, found: RealResults) -> str:
     made = ". ".join(f"{', '.join(names)}: {origin}" for origin, names in origins.items())
     line = (
         "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians. ± is half the 95 % "
-        f"interval of the gain over the trainings; bold excludes zero. {made}."
+        f"interval of the difference over the trainings; bold excludes zero. {made}."
     )
     if absent:
         line += f" Still to be measured: {', '.join(absent)}."

@@ -104,7 +104,7 @@ def test_the_table_has_means_over_seeds_and_published_figures() -> None:
 def test_the_short_table_has_a_row_per_scene() -> None:
     table = summary_table(read_real_list(), results())
     (row,) = [line for line in table.splitlines() if line.startswith("| blurball")]
-    assert row.endswith("| 29.00 / 0.200 | 30.00 / 0.200 | **+1.00 ± 0.00** | 2.0 and 2.0 |")
+    assert row.endswith("| 29.00 / 0.200 | 30.00 / 0.200 | **+1.00 ± 0.00** / +0.000 ± 0.000 | 2.0 and 2.0 |")
     assert "| *Deblur-NeRF, 200,000 iterations, on blurball* |  | *27.33 / 0.223* |  |  |" in table
     assert "blurball: mean of 2 trainings, version 0.2.0, abc." in table and "CoMoGaussian" not in table
     assert "Still to be measured: kitchen, office, fox, terrace, bonsai." in table
@@ -136,7 +136,7 @@ def test_variants_of_an_earlier_call_stay_with_their_version() -> None:
     again = added.with_results(Comparison(cells=[cell("full", 0, 31.0)]), "0.3.0, def")
     assert list(again.scenes["blurball"]) == ["all-view", "full", "paper-open"]
     assert [one.means["psnr"] for one in again.scenes["blurball"]["full"].cells] == [31.0]
-    assert "| +3.00 | 2.0 and 2.0 |" in summary_table(listed, again), "pairs of the same seed"
+    assert "| +3.00 / +0.000 | 2.0 and 2.0 |" in summary_table(listed, again), "pairs of the same seed"
 
 
 def test_a_page_gets_the_tables_that_it_has_places_for() -> None:
