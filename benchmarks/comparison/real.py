@@ -180,11 +180,18 @@ class RealResults(Figures):
 
 
 def read_results(path: Path) -> RealResults:
-    """Read ``real.json``; return empty results if the file is missing or has another form."""
+    """Read ``real.json``; return empty results if the file is missing.
+
+    Raises:
+        InputError: if the file cannot be read, or has another form.
+    """
+    if not path.exists():
+        return RealResults()
     try:
         return RealResults.model_validate_json(read_bytes(path))
-    except (OSError, ValidationError):
-        return RealResults()
+    except (OSError, ValidationError) as error:
+        hint = "move it away, and repeat the command that made it: trainings in the store are not repeated"
+        raise InputError(f"{path} cannot be read, or has another form", hint=hint) from error
 
 
 def real_table(listed: RealList, found: RealResults) -> str:
@@ -225,8 +232,9 @@ def summary_table(listed: RealList, found: RealResults) -> str:
     rows, absent = [], []
     origins: dict[str, list[str]] = {}
     for scene in listed.scenes:
-        stored = found.scenes.get(scene.name)
-        if stored is None:
+        stored = found.scenes.get(scene.name, {})
+        shown = {variant: made for variant, made in stored.items() if variant in _COMPARED}
+        if not shown:
             absent.append(scene.name)
             continue
         before, after = (found.cells.of("held-out", scene.name, name) for name in _COMPARED)
@@ -248,7 +256,6 @@ def summary_table(listed: RealList, found: RealResults) -> str:
             if one.scene == scene.name:
                 lpips = "-" if one.lpips is None else f"{one.lpips:.3f}"
                 rows.append([f"*{one.method}, on {one.scene}*", "", f"*{one.psnr:.2f} / {lpips}*", "", ""])
-        shown = {variant: made for variant, made in stored.items() if variant in _COMPARED}
         origins.setdefault(without_digest(_origins(shown)), []).append(scene.name)
     made = ". ".join(f"{', '.join(names)}: {origin}" for origin, names in origins.items())
     line = (

@@ -139,6 +139,19 @@ def test_variants_of_an_earlier_call_stay_with_their_version() -> None:
     assert "| +3.00 / +0.000 | 2.0 and 2.0 |" in summary_table(listed, again), "pairs of the same seed"
 
 
+def test_a_scene_without_the_compared_variants_is_still_to_be_measured() -> None:
+    only = RealResults().with_results(Comparison(cells=[cell("paper-open", 0, 24.0)]), "0.3.0, def")
+    table = summary_table(read_real_list(), only)
+    assert "| blurball" not in table and "Still to be measured: blurball, kitchen" in table
+    assert "| blurball | paper's method, open models | 24.00" in real_table(read_real_list(), only)
+
+
+def test_results_of_another_form_are_not_taken_for_none(tmp_path: Path) -> None:
+    (tmp_path / "real.json").write_text('{"scenes": {"fox": {"version": "0.1.0", "seeds": 1, "cells": []}}}')
+    with pytest.raises(InputError, match="another form"):
+        read_results(tmp_path / "real.json")
+
+
 def test_a_page_gets_the_tables_that_it_has_places_for() -> None:
     listed, found = read_real_list(), results()
     short, full = "<!-- real -->\nstale\n<!-- /real -->\n", "<!-- real-full -->\n<!-- /real-full -->\n"
