@@ -100,7 +100,7 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
 
 
 class FastGrowth(TrainConfig):
-    growth: ClassVar[float] = 0.3  # type: ignore[misc]
+    growth: ClassVar[float] = 0.3
 
 
 CONFIG = FastGrowth(
