@@ -94,8 +94,8 @@ class TrainConfig(FrozenModel):
     quality: Quality = Field(
         "standard",
         description="size of all trainings if steps and budget are unset: draft has a quarter of the steps "
-        "and half of the Gaussians of standard, high has 4 times the steps and twice the Gaussians. A draft "
-        "also has no more than 60 frames of 640 px, ends with G0 and makes no repairs",
+        "of standard and half of its maximum number of Gaussians; high has 4 times the steps and twice the "
+        "Gaussians. A draft also has no more than 60 frames of 640 px, ends with G0 and makes no repairs",
     )
     steps: int | None = Field(
         None,

@@ -72,7 +72,7 @@ def test_estimated_growth_equals_the_log() -> None:
 
 
 def test_high_quality_grows_to_twice_the_gaussians_of_standard() -> None:
-    """Without a budget in the way, as in most captures that start from 10,000 Gaussians."""
+    """Without a budget that ends the growth before."""
     standard, high = (
         TrainConfig(steps=steps_from_frames(100, quality), budget=20_000_000, quality=quality)
         for quality in ("standard", "high")
