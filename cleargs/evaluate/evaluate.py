@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -28,6 +27,7 @@ from cleargs.media.exr import read_depth
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
+from cleargs.plugins import installed_version
 from cleargs.progress import Reporter
 from cleargs.splat.backend import decibels, rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
@@ -275,7 +275,7 @@ def _evaluate(
         weights=measures.weights,
         versions={
             **versions(),
-            **{name: version(name) for name in _LIBRARIES},
+            **{name: installed_version(name) for name in _LIBRARIES},
             "onnxruntime": installed_runtimes(),
         },
         images=tuple(images),
