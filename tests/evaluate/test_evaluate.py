@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import cv2
@@ -30,6 +32,7 @@ from numpy.typing import NDArray
 from OpenImageIO import ImageOutput, ImageSpec
 from scipy.spatial.transform import Rotation
 
+from cleargs import plugins
 from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.errors import InputError
@@ -128,6 +131,22 @@ def test_own_renders_are_perfect_in_the_scenes_world(tmp_path: Path) -> None:
     found = measured(run / "g0" / "scene.ply", in_own_world(folder))
     assert psnr_of(found) > NEARLY_EQUAL and found.alignment.world == "scene"
     assert found.images[0].prediction and found.scene is not None
+
+
+def test_a_library_without_a_distribution_is_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Conda's OpenCV, for example, is not a distribution of that name."""
+
+    def version(name: str) -> str:
+        if name == "opencv-contrib-python-headless":
+            raise PackageNotFoundError(name)
+        return importlib.metadata.version(name)
+
+    monkeypatch.setattr(plugins, "version", version)
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras())
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME)
+    versions = measured(run / "g0" / "scene.ply", in_own_world(folder)).versions
+    assert versions["opencv-contrib-python-headless"] == "absent" != versions["torch"]
 
 
 def test_poses_go_through_ingests_similarity(tmp_path: Path) -> None:
