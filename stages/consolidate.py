@@ -67,19 +67,16 @@ def preflight(config: ConsolidateConfig) -> None:
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """Return the cost of the training."""
-    from cleargs.splat.budget import training_cost
+    from .cost import distillation, peak_memory, thread_factor
 
-    from .cost import capture_size, pace
-
-    g0, (frames, megapixels) = context.settings["g0"], capture_size(context)
+    g0 = context.settings["g0"]
     if g0.quality == "draft":
         return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
-    training = context.config.distil.applied_to(g0, frames)
-    seconds, memory = training_cost(training, frames, megapixels)
+    cost = distillation(context, context.config.distil)
     return Estimate(
-        minutes=seconds * pace(context.threads) / 60.0,
-        memory_gb=1.0 + memory + g0.cache_mb / 1024.0,
-        disk_gb=0.5 * memory,  # scene and moments: 0.7 kB per Gaussian of SH degree 3
+        minutes=cost.seconds * thread_factor(context.threads) / 60.0,
+        memory_gb=peak_memory(context, cost, g0.cache_mb),
+        disk_gb=cost.disk_gb,
     )
 
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.errors import StoreError
 from cleargs.pipeline.stage import StageContext
+from cleargs.splat.budget import TrainingCost, training_cost
+
+if TYPE_CHECKING:
+    from .config import DistilConfig
+    from .g0 import G0Config
 
 _UNKNOWN = (60, 0.5)  # number of frames, and megapixels per frame, that are assumed for an unknown capture
 _POINTS_PER_FRAME = 250
@@ -28,7 +33,7 @@ def capture_size(context: StageContext[Any]) -> tuple[int, float]:
     return len(frames), max((f.width * f.height for f in frames), default=0) / 1e6
 
 
-def sparse_points(context: StageContext[Any]) -> int:
+def _sparse_points(context: StageContext[Any]) -> int:
     """Return the number of sparse points. Estimate it before ingest, and if the points cannot be read."""
     if "ingest" in context.inputs:
         with suppress(StoreError):
@@ -36,6 +41,24 @@ def sparse_points(context: StageContext[Any]) -> int:
     return _POINTS_PER_FRAME * capture_size(context)[0]
 
 
-def pace(threads: int) -> float:
+def first_training(context: StageContext[Any], g0: G0Config) -> TrainingCost:
+    """Return the cost of G0."""
+    return training_cost(g0, *capture_size(context), max(g0.min_points, _sparse_points(context)))
+
+
+def distillation(context: StageContext[Any], config: DistilConfig) -> TrainingCost:
+    """Return the cost of a training with the settings ``config`` that continues G0's scene."""
+    g0, (frames, megapixels) = context.settings["g0"], capture_size(context)
+    start = first_training(context, g0).gaussians
+    return training_cost(config.applied_to(g0, frames), frames, megapixels, start)
+
+
+def peak_memory(context: StageContext[Any], cost: TrainingCost, cache_mb: int) -> float:
+    """Return the memory of a stage, GB: libraries, the training, and decoded images up to ``cache_mb``."""
+    frames, megapixels = capture_size(context)
+    return 1.0 + cost.memory_gb + min(cache_mb / 1024, 0.003 * megapixels * frames)
+
+
+def thread_factor(threads: int) -> float:
     """Return the time on ``threads`` threads relative to the measurements on two threads (Amdahl's law)."""
     return (_SERIAL + (1.0 - _SERIAL) / threads) / (_SERIAL + (1.0 - _SERIAL) / 2)

@@ -78,22 +78,15 @@ def preflight(config: G0Config) -> None:
 
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
-    """Estimate the cost. The time is the number of steps times a cost per pixel and per Gaussian.
+    """Return the cost of the training."""
+    from .cost import first_training, peak_memory, thread_factor
 
-    The memory is that of the images, the Gaussians and the buffers of the kernels.
-    """
-    from cleargs.splat.budget import training_cost
-
-    from .cost import capture_size, pace, sparse_points
-
-    config = context.config
-    count, megapixels = capture_size(context)
-    start = max(config.min_points, sparse_points(context))
-    seconds, memory = training_cost(config, count, megapixels, start)
-    seconds *= pace(context.threads)
-    disk = 0.5 * memory  # scene and moments: 0.7 kB per Gaussian of SH degree 3
-    memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
-    return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=disk)
+    cost = first_training(context, context.config)
+    return Estimate(
+        minutes=cost.seconds * thread_factor(context.threads) / 60.0,
+        memory_gb=peak_memory(context, cost, context.config.cache_mb),
+        disk_gb=cost.disk_gb,
+    )
 
 
 def run(context: StageContext[G0Config]) -> StageResult:

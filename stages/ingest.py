@@ -100,7 +100,7 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
     from cleargs.capture.sources import frame_size, open_capture
     from cleargs.media.image import reduced_size
 
-    from .cost import pace
+    from .cost import thread_factor
 
     config = context.config
     capture = open_capture(context.source, config)
@@ -121,7 +121,7 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
         matched = min(megapixels, config.max_features / _FEATURES_PER_MEGAPIXEL)
         parallel += pairs * (_PAIR_S + _PAIR_S_PER_SQUARE_MEGAPIXEL * matched**2)
         alone += (_TRIANGULATION_S if capture.posed else _MAPPING_S) * megapixels * count
-    seconds = parallel * pace(context.threads) + alone
+    seconds = parallel * thread_factor(context.threads) + alone
     disk = count * 2 * 1.6e-3 * megapixels + (0.0005 * count if needs_poses else 0.0)
     return Estimate(
         minutes=seconds / 60,

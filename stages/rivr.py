@@ -156,9 +156,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     On two cores, per megapixel, undoing motion takes about 3 s, restoring 1 s (40 s with an expert other than
     the embedded one), and making and scoring candidates 2 s. The scene of every group is kept until the end.
     """
-    from cleargs.splat.budget import training_cost
-
-    from .cost import capture_size, pace
+    from .cost import capture_size, distillation, peak_memory, thread_factor
 
     config, g0 = context.config, context.settings["g0"]
     frames, megapixels = capture_size(context)
@@ -169,16 +167,15 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * targets * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
-    distilling, memory = training_cost(config.distil.applied_to(g0, frames), frames, megapixels)
-    seconds += config.rounds * distilling
-    scene = context.inputs.get("g0", Path()) / "scene.ply"
+    cost = distillation(context, config.distil)
+    seconds += config.rounds * cost.seconds
     groups = 1 if config.group is None else -(-targets // config.group)
-    scenes = config.rounds * groups * scene.stat().st_size / 1e9 if scene.is_file() else 0.0
+    # A target's EXR took 4 to 9 MB per megapixel. The scene is a third of a scene with its moments.
+    kept = config.rounds * (0.01 * megapixels * targets + groups * cost.disk_gb / 3.0)
     return Estimate(
-        minutes=seconds * pace(context.threads) / 60.0,
-        memory_gb=1.0 + memory + g0.cache_mb / 1024.0,
-        # A target's EXR took 4 to 9 MB per megapixel; scene and moments: 0.7 kB per Gaussian of SH degree 3.
-        disk_gb=0.01 * megapixels * targets * config.rounds + 0.5 * memory + scenes,
+        minutes=seconds * thread_factor(context.threads) / 60.0,
+        memory_gb=peak_memory(context, cost, g0.cache_mb),
+        disk_gb=kept + cost.disk_gb,
     )
 
 

@@ -220,7 +220,7 @@ def _seconds(section: Section, context: EvidenceContext, is_new: Callable[..., b
             if not is_new(sample, total, variant.name):
                 continue
             whole = g0.model_copy(update={"steps": total})
-            training, _ = training_cost(whole, section.frames, megapixels, g0.min_points)
+            training = training_cost(whole, section.frames, megapixels, g0.min_points).seconds
             if variant.stage != "g0":
                 # Variants that differ only in RIVR share the first scene.
                 scene = (

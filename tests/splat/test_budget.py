@@ -88,6 +88,5 @@ def test_later_steps_are_estimated_to_take_longer() -> None:
     fractions = trainer.work_fractions()
     assert fractions[0] == 0.0 and len(fractions) == 1001 and fractions[-1] == pytest.approx(1.0)
     assert fractions[500] < 0.5, "growth and full-size images are in the second half"
-    few, _ = training_cost(config, 100, 0.4, 20_000)
-    many, _ = training_cost(config, 100, 0.4)
-    assert few < many
+    few, many = (training_cost(config, 100, 0.4, start) for start in (20_000, 400_000))
+    assert few.seconds < many.seconds and few.gaussians < many.gaussians == 300_000

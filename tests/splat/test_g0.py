@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,8 @@ from cleargs.splat.constants import SH_C0
 from cleargs.splat.ply import read_ply
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
-from cleargs.stages import g0
+from cleargs.stages import cost, g0
+from cleargs.stages.config import DistilConfig
 from cleargs.stages.g0 import G0Config
 
 ACTIVE = {0: 0.9, 1: 0.97, 2: 1.0, 5: 0.12}
@@ -139,7 +141,15 @@ def test_only_active_frames_train_the_scene(capture: Path, tmp_path: Path) -> No
     exposure = read_exposure(tmp_path / "out" / "exposure.parquet")
     assert exposure.frame_ids.tolist() == sorted(ACTIVE)
     assert not exposure.enabled
-    assert g0.estimate(context(capture, tmp_path)).minutes > 0
+    assert g0.estimate(context(capture, tmp_path)).disk_gb == pytest.approx(0.7e-6 * 120)
+
+
+def test_later_trainings_are_estimated_from_the_scene_that_g0_reaches(capture: Path, tmp_path: Path) -> None:
+    """The maximum number of Gaussians is not reached. It would make them ten times as expensive."""
+    config = CONFIG.model_copy(update={"budget": 100_000})
+    ready = replace(context(capture, tmp_path, config), settings={"g0": config})
+    first, later = cost.first_training(ready, config), cost.distillation(ready, DistilConfig())
+    assert 100 < first.gaussians < 1000 and later.gaussians == first.gaussians
 
 
 def test_threads_and_a_kill_change_no_byte(
