@@ -67,17 +67,12 @@ def preflight(config: ConsolidateConfig) -> None:
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """Return the cost of the training."""
-    from .cost import distillation, peak_memory, thread_factor
+    from .cost import distillation, expected
 
     g0 = context.settings["g0"]
     if g0.quality == "draft":
         return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
-    cost = distillation(context, context.config.distil)
-    return Estimate(
-        minutes=cost.seconds * thread_factor(context.threads) / 60.0,
-        memory_gb=peak_memory(context, cost, g0.cache_mb),
-        disk_gb=cost.disk_gb,
-    )
+    return expected(context, distillation(context, context.config.distil), g0.cache_mb)
 
 
 def run(context: StageContext[ConsolidateConfig]) -> StageResult:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.errors import StoreError
-from cleargs.pipeline.stage import StageContext
+from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.splat.budget import TrainingCost, training_cost
 
 if TYPE_CHECKING:
@@ -53,10 +53,17 @@ def distillation(context: StageContext[Any], config: DistilConfig) -> TrainingCo
     return training_cost(config.applied_to(g0, frames), frames, megapixels, start)
 
 
-def peak_memory(context: StageContext[Any], cost: TrainingCost, cache_mb: int) -> float:
-    """Return the memory of a stage, GB: libraries, the training, and decoded images up to ``cache_mb``."""
+def expected(context: StageContext[Any], cost: TrainingCost, cache_mb: int, seconds: float = 0.0) -> Estimate:
+    """Return the cost of a stage with this training, and ``seconds`` of other work on two idle cores.
+
+    The memory is that of libraries, the training, and decoded images up to ``cache_mb``.
+    """
     frames, megapixels = capture_size(context)
-    return 1.0 + cost.memory_gb + min(cache_mb / 1024, 0.003 * megapixels * frames)
+    return Estimate(
+        minutes=(cost.seconds + seconds) * thread_factor(context.threads) / 60.0,
+        memory_gb=1.0 + cost.memory_gb + min(cache_mb / 1024, 0.003 * megapixels * frames),
+        disk_gb=cost.disk_gb,
+    )
 
 
 def thread_factor(threads: int) -> float:

@@ -79,14 +79,9 @@ def preflight(config: G0Config) -> None:
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
     """Return the cost of the training."""
-    from .cost import first_training, peak_memory, thread_factor
+    from .cost import expected, first_training
 
-    cost = first_training(context, context.config)
-    return Estimate(
-        minutes=cost.seconds * thread_factor(context.threads) / 60.0,
-        memory_gb=peak_memory(context, cost, context.config.cache_mb),
-        disk_gb=cost.disk_gb,
-    )
+    return expected(context, first_training(context, context.config), context.config.cache_mb)
 
 
 def run(context: StageContext[G0Config]) -> StageResult:

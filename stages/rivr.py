@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -156,7 +156,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     On two cores, per megapixel, undoing motion takes about 3 s, restoring 1 s (40 s with an expert other than
     the embedded one), and making and scoring candidates 2 s. The scene of every group is kept until the end.
     """
-    from .cost import capture_size, distillation, peak_memory, thread_factor
+    from .cost import capture_size, distillation, expected
 
     config, g0 = context.config, context.settings["g0"]
     frames, megapixels = capture_size(context)
@@ -168,15 +168,11 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * targets * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
     cost = distillation(context, config.distil)
-    seconds += config.rounds * cost.seconds
+    whole = expected(context, cost, g0.cache_mb, seconds + (config.rounds - 1) * cost.seconds)
     groups = 1 if config.group is None else -(-targets // config.group)
     # A target's EXR took 4 to 9 MB per megapixel. The scene is a third of a scene with its moments.
     kept = config.rounds * (0.01 * megapixels * targets + groups * cost.disk_gb / 3.0)
-    return Estimate(
-        minutes=seconds * thread_factor(context.threads) / 60.0,
-        memory_gb=peak_memory(context, cost, g0.cache_mb),
-        disk_gb=kept + cost.disk_gb,
-    )
+    return replace(whole, disk_gb=whole.disk_gb + kept)
 
 
 def run(context: StageContext[RivrConfig]) -> StageResult:
