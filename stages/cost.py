@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from .g0 import G0Config
 
 _UNKNOWN = (60, 0.5)  # number of frames, and megapixels per frame, that are assumed for an unknown capture
-_POINTS_PER_FRAME = 250
-"""Sparse points per frame that are assumed before ingest: captures of 16 to 150 frames gave 80 to 350."""
+_POINTS_PER_FRAME = 250  # assumed before ingest: captures of 16 to 150 frames gave 80 to 350 sparse points
 _SERIAL = 0.1  # share of the work that is not parallel (a guess)
 
 
@@ -24,13 +23,11 @@ def capture_size(context: StageContext[Any]) -> tuple[int, float]:
     """Return the number of placed training frames and megapixels of the largest; estimates before ingest."""
     if (expected := context.expected.get("ingest")) is not None and expected.frames:
         return expected.frames, expected.megapixels
-    if "ingest" not in context.inputs:
-        return _UNKNOWN
-    try:
-        frames = [f for f in load_frames(context.inputs["ingest"]) if f.registered and f.split == "train"]
-    except StoreError:
-        return _UNKNOWN
-    return len(frames), max((f.width * f.height for f in frames), default=0) / 1e6
+    if "ingest" in context.inputs:
+        with suppress(StoreError):
+            frames = [f for f in load_frames(context.inputs["ingest"]) if f.registered and f.split == "train"]
+            return len(frames), max((f.width * f.height for f in frames), default=0) / 1e6
+    return _UNKNOWN
 
 
 def _sparse_points(context: StageContext[Any]) -> int:
@@ -56,13 +53,14 @@ def distillation(context: StageContext[Any], config: DistilConfig) -> TrainingCo
 def expected(context: StageContext[Any], cost: TrainingCost, cache_mb: int, seconds: float = 0.0) -> Estimate:
     """Return the cost of a stage with this training, and ``seconds`` of other work on two idle cores.
 
-    The memory is that of libraries, the training, and decoded images up to ``cache_mb``.
+    Memory is taken by libraries, Gaussians (1.8 to 3.5 kB each in four real captures) and decoded images, up
+    to ``cache_mb``. Disk is taken by the scene and its moments, 0.7 kB per Gaussian of SH degree 3.
     """
     frames, megapixels = capture_size(context)
     return Estimate(
         minutes=(cost.seconds + seconds) * thread_factor(context.threads) / 60.0,
-        memory_gb=1.0 + cost.memory_gb + min(cache_mb / 1024, 0.003 * megapixels * frames),
-        disk_gb=cost.disk_gb,
+        memory_gb=1.0 + 2.7e-6 * cost.gaussians + min(cache_mb / 1024, 0.003 * megapixels * frames),
+        disk_gb=0.7e-6 * cost.gaussians,
     )
 
 

@@ -171,7 +171,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     whole = expected(context, cost, g0.cache_mb, seconds + (config.rounds - 1) * cost.seconds)
     groups = 1 if config.group is None else -(-targets // config.group)
     # A target's EXR took 4 to 9 MB per megapixel. The scene is a third of a scene with its moments.
-    kept = config.rounds * (0.01 * megapixels * targets + groups * cost.disk_gb / 3.0)
+    kept = config.rounds * (0.01 * megapixels * targets + groups * whole.disk_gb / 3.0)
     return replace(whole, disk_gb=whole.disk_gb + kept)
 
 

@@ -59,16 +59,6 @@ class TrainingCost(NamedTuple):
     seconds: float  # wall seconds on two idle cores
     gaussians: int  # number at the end
 
-    @property
-    def memory_gb(self) -> float:
-        """Memory without libraries and images: four real captures took 1.8 to 3.5 kB per Gaussian."""
-        return 2.7e-6 * self.gaussians
-
-    @property
-    def disk_gb(self) -> float:
-        """Disk of the scene and its moments: 0.7 kB per Gaussian of SH degree 3."""
-        return 0.7e-6 * self.gaussians
-
 
 def training_cost(config: TrainConfig, frames: int, megapixels: float, start: int) -> TrainingCost:
     """Estimate the cost of a training that begins with ``start`` Gaussians. ``megapixels`` are per frame.
@@ -77,9 +67,8 @@ def training_cost(config: TrainConfig, frames: int, megapixels: float, start: in
     """
     budget = config.budget_for(round(frames * megapixels * 1e6))
     whole = config.model_copy(update={"steps": config.steps_for(frames), "budget": budget})
-    start = min(start, budget)
-    seconds = seconds_by_step(whole, frames, megapixels, start).sum()
-    return TrainingCost(float(seconds), int(gaussians_by_step(whole, start)[-1]))
+    seconds = seconds_by_step(whole, frames, megapixels, min(start, budget)).sum()
+    return TrainingCost(float(seconds), int(gaussians_by_step(whole, min(start, budget))[-1]))
 
 
 def resolve_config(config: Settings, views: Sequence[TrainingView]) -> Settings:

@@ -38,15 +38,11 @@ class Camera:
         if pose.shape != (4, 4):
             raise InputError(f"world_to_camera has the shape {pose.shape}", hint="give a [4, 4] rigid matrix")
         numbers = (self.fx, self.fy, self.cx, self.cy)
-        if self.width < 1 or self.height < 1 or not (np.isfinite(numbers).all() and np.isfinite(pose).all()):
+        positive = min(self.width, self.height, self.fx, self.fy) > 0
+        if not (positive and np.isfinite(numbers).all() and np.isfinite(pose).all()):
             raise InputError(
                 f"the camera is not usable: {self.width}x{self.height}, fx fy cx cy = {numbers}",
-                hint="give positive sizes and finite numbers",
-            )
-        if self.fx <= 0 or self.fy <= 0:
-            raise InputError(
-                f"the focal lengths {self.fx}, {self.fy} are not positive",
-                hint="give focal lengths in pixels",
+                hint="give positive sizes and focal lengths, in pixels, and finite numbers",
             )
 
     @property
