@@ -104,12 +104,12 @@ def measure(capture: Path, work: Path, size: int) -> list[dict[str, str | float]
         width, height = frames[0].width, frames[0].height
         lens = pinhole(width, height, focal * (1 + wrong), focal * (1 + wrong), width / 2, height / 2)
         sfm = _worker([replace(frame, camera=lens) for frame in frames], noisy, work, config)
-        assert sfm._job.poses is not None
-        start = sfm._triangulate(sfm._job.poses[OWN])
-        adjuster = Adjuster(sfm._database, sfm._with_points)
+        assert sfm.job.poses is not None
+        start = sfm.triangulate(sfm.job.poses[OWN])
+        adjuster = Adjuster(sfm.database, sfm.with_points)
         adjusted = adjuster.refine(start, cameras=True) if len(start.points3D) else None
         if name == "exact":
-            found, _ = sfm._sfm_over(start, sfm._pairs(), adjuster)
+            found, _ = sfm.sfm_over(start, sfm.pairs(), adjuster)
             gain = np.nan if found is None else _gain(adjuster, found)
         models = (start, adjusted, found)
         errors = [np.nan if model is None else adjuster.median_error(model) for model in models]
@@ -125,7 +125,7 @@ def _reconstructed(
 ) -> tuple[list[WorkFrame], list[Pose], float]:
     """Return the frames that SfM places, their poses, and the focal length."""
     sfm = _worker(frames, None, work, config)
-    model, _ = sfm._mapped(sfm._pairs())
+    model, _ = sfm.mapped(sfm.pairs())
     by_name = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     placed = [frame for frame in frames if frame.image in by_name]
     (work / "database.db").unlink()
@@ -136,15 +136,15 @@ def _reconstructed(
 
 def _worker(
     frames: Sequence[WorkFrame], poses: Sequence[Pose] | None, work: Path, config: SfmConfig
-) -> sfm_worker._Sfm:
+) -> sfm_worker.Sfm:
     """Return COLMAP's worker for ``frames``, with their features extracted and matched."""
     job = job_of(frames, None if poses is None else {OWN: poses}, work, config, 0, 1)
-    sfm = sfm_worker._Sfm(job, lambda **_: None)
+    sfm = sfm_worker.Sfm(job, lambda **_: None)
     pycolmap.set_random_seed(0)
-    create_database(sfm._database, job)
-    sfm._extract(sfm._database, job.names, FIRST)
-    sfm._match(sfm._database, sfm._pairs())
-    sfm._output.mkdir(exist_ok=True)
+    create_database(sfm.database, job)
+    sfm.extract(sfm.database, job.names, FIRST)
+    sfm.match(sfm.database, sfm.pairs())
+    sfm.output.mkdir(exist_ok=True)
     return sfm
 
 
@@ -172,5 +172,5 @@ def _gain(adjuster: Adjuster, model: pycolmap.Reconstruction) -> float:
     simple = adjuster.adjust(simple, cameras=True)
     full = copy.deepcopy(simple)
     set_lens(full, FULL_LENS)
-    full = adjuster._adjusted(full, cameras=True)
+    full = adjuster.bundle_adjusted(full, cameras=True)
     return 1 - adjuster.mean_error(full) / adjuster.mean_error(simple)

@@ -90,7 +90,7 @@ class Adjuster:
             set_lens(refined, FIRST_LENS)
         # At better poses more features find their points: adjustment and triangulation alternate.
         for _ in range(_ROUNDS):
-            refined = self._adjusted(refined, cameras=cameras)
+            refined = self.bundle_adjusted(refined, cameras=cameras)
         if cameras and lens_of(refined) == FIRST_LENS:
             refined = self._with_measured_lens(refined)
         held = _held(refined)
@@ -98,7 +98,7 @@ class Adjuster:
 
     def adjust(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
         """Return ``model``, which all matches made, after an adjustment without the kept-out matches."""
-        adjusted = self._adjusted(self._triangulate(copy.deepcopy(model), self._cut), cameras=cameras)
+        adjusted = self.bundle_adjusted(self._triangulate(copy.deepcopy(model), self._cut), cameras=cameras)
         placed = [image for image in adjusted.images.values() if image.has_pose]
         return _anchored(adjusted, model, _held(adjusted) or placed)
 
@@ -120,14 +120,14 @@ class Adjuster:
     def _with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         full = copy.deepcopy(model)
         set_lens(full, FULL_LENS)
-        full = self._adjusted(full, cameras=True)
+        full = self.bundle_adjusted(full, cameras=True)
         better = self.mean_error(full) < (1 - _LENS_GAIN) * self.mean_error(model)
         return full if better and _held(full) else model
 
-    def _adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
-        options = pycolmap.BundleAdjustmentOptions(
-            refine_focal_length=cameras, refine_extra_params=cameras, print_summary=False
-        )
+    def bundle_adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
+        """Return ``model`` after one bundle adjustment and a triangulation without the kept-out matches."""
+        options = pycolmap.BundleAdjustmentOptions(refine_focal_length=cameras, refine_extra_params=cameras)
+        options.print_summary = False
         # A robust loss, because some matches are still wrong.
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.solver_options.num_threads = 1

@@ -49,17 +49,17 @@ class Features:
     """The steps of a job that find and match features in its database."""
 
     def __init__(self, job: Job, report: Callable[..., None]) -> None:
-        self._job = job
+        self.job = job
         self._report = report
-        self._database = job.folder / "database.db"
+        self.database = job.folder / "database.db"
 
-    def _extract(self, database: Path, names: Sequence[str], settings: FeatureSettings) -> None:
+    def extract(self, database: Path, names: Sequence[str], settings: FeatureSettings) -> None:
         """Find SIFT features in the working images. COLMAP skips frames that already have features.
 
         Frames in which ``settings`` find few features get fainter ones too, unless a killed run has already
         matched pairs.
         """
-        job = self._job
+        job = self.job
         limit = _FEW_FEATURES * job.config.max_features if settings.contrast > _FAINT else 0
         options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         largest = max(max(camera.width, camera.height) for camera in job.cameras)
@@ -87,21 +87,22 @@ class Features:
                 )
             self._report(done=start + len(block))
 
-    def _match(self, database: Path, pairs: Sequence[tuple[int, int]], again: str = "") -> None:
-        job = self._job
+    def match(self, database: Path, pairs: Sequence[tuple[int, int]], again: str = "") -> None:
+        """Match the features of ``pairs`` and keep the verified matches in ``database``."""
         self._report(phase=f"matching{again}", total=len(pairs))
-        match_pairs(database, job.names, pairs, job.seed, job.threads, lambda n: self._report(done=n))
+        names, seed, threads = self.job.names, self.job.seed, self.job.threads
+        match_pairs(database, names, pairs, seed, threads, lambda number: self._report(done=number))
 
-    def _pairs(self) -> list[tuple[int, int]]:
+    def pairs(self) -> list[tuple[int, int]]:
         """Return all pairs of frames, or neighbours and distant frames that look alike."""
-        frames, config = len(self._job.names), self._job.config
+        frames, config = len(self.job.names), self.job.config
         if frames < config.exhaustive_below:
             return list(combinations(range(frames), 2))
         near = sequential_pairs(frames, config.overlap)
         if not config.loop_candidates:
             return near
         self._report(phase="looking for loops", total=None)
-        with pycolmap.Database.open(self._database) as opened:
+        with pycolmap.Database.open(self.database) as opened:
             descriptors = [np.asarray(opened.read_descriptors(index + 1).data) for index in range(frames)]
-        loops = loop_pairs(descriptors, config.loop_candidates, 2 * config.overlap, self._job.seed)
+        loops = loop_pairs(descriptors, config.loop_candidates, 2 * config.overlap, self.job.seed)
         return sorted({*near, *loops})

@@ -66,36 +66,35 @@ def main() -> int:
     report = reports_to_parent()
     job = Job.model_validate(read_json(Path(sys.argv[1])))
     try:
-        _Sfm(job, report).run()
+        Sfm(job, report).run()
     except StageError as error:
         report(error=str(error), hint=error.hint)
         return 3
     return 0
 
 
-class _Sfm(Features):
+class Sfm(Features):
     """The steps of a job."""
 
     def __init__(self, job: Job, report: Callable[..., None]) -> None:
         super().__init__(job, report)
-        self._matched = self._database
+        self._matched = self.database
         """The database with the features by which frames were placed."""
         self._torn_at: int | None = None
-        self._output = job.folder / "model.partial"
-        self._options = pycolmap.IncrementalPipelineOptions(
-            num_threads=1, random_seed=job.seed, extract_colors=False
-        )
+        self.output = job.folder / "model.partial"
+        self._options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=job.seed)
+        self._options.extract_colors = False
         self._options.mapper.num_threads = 1
         self._options.mapper.random_seed = job.seed
         self._options.triangulation.random_seed = job.seed
 
     def run(self) -> None:
         """Make the model and its `SfmOutcome`. Raises StageError if the frames give none."""
-        job = self._job
+        job = self.job
         pycolmap.set_random_seed(job.seed)
-        create_database(self._database, job)
-        self._extract(self._database, job.names, FIRST)
-        with pycolmap.Database.open(self._database) as opened:
+        create_database(self.database, job)
+        self.extract(self.database, job.names, FIRST)
+        with pycolmap.Database.open(self.database) as opened:
             if opened.num_keypoints() == 0:
                 raise StageError(
                     "no features were found in any frame",
@@ -107,22 +106,22 @@ class _Sfm(Features):
                 f"all {len(job.names)} frames show the same picture",
                 hint="the camera must move while it records; look whether the video froze",
             )
-        pairs = self._pairs()
-        self._match(self._database, pairs)
-        make_folder(self._output, empty=True)
+        pairs = self.pairs()
+        self.match(self.database, pairs)
+        make_folder(self.output, empty=True)
         if job.poses is not None:
             model, outcome = self._from_poses(job.poses, pairs)
         else:
-            model, placed = self._mapped(pairs)
+            model, placed = self.mapped(pairs)
             if job.config.camera_model == "auto":
                 self._report(phase="measuring the lens", total=None)
-                model = Adjuster(self._matched, self._with_points).with_measured_lens(model)
+                model = Adjuster(self._matched, self.with_points).with_measured_lens(model)
             outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model), torn_at=self._torn_at)
-        make_folder(self._output, empty=True)
-        model.write_binary(self._output)
-        write_json(self._output / OUTCOME, outcome.model_dump())
-        sync_tree(self._output)
-        self._output.rename(job.folder / "model")
+        make_folder(self.output, empty=True)
+        model.write_binary(self.output)
+        write_json(self.output / OUTCOME, outcome.model_dump())
+        sync_tree(self.output)
+        self.output.rename(job.folder / "model")
         sync(job.folder)
 
     def _from_poses(
@@ -130,19 +129,19 @@ class _Sfm(Features):
     ) -> tuple[pycolmap.Reconstruction, SfmOutcome]:
         """Return the model at the input's poses, or at other poses if the images contradict these."""
         convention = self._convention(given)
-        start = self._triangulate(given[convention])
+        start = self.triangulate(given[convention])
         missed = median_residual(start)
         outcome = SfmOutcome(missed_px=missed, convention=convention)
-        if missed <= self._job.config.refine_above and len(start.points3D):
+        if missed <= self.job.config.refine_above and len(start.points3D):
             return start, outcome
-        adjuster = Adjuster(self._database, self._with_points)
+        adjuster = Adjuster(self.database, self.with_points)
         models = {"given": start}
         self._report(phase="adjusting poses and cameras", total=None)
-        shared = len(self._job.names) >= SHARED_BY * len(self._job.cameras)
+        shared = len(self.job.names) >= SHARED_BY * len(self.job.cameras)
         adjusted = adjuster.refine(start, cameras=shared) if len(start.points3D) else None
         if adjusted is not None:
             models["adjusted"] = adjusted
-        found, placed = self._sfm_over(start, pairs, adjuster)
+        found, placed = self.sfm_over(start, pairs, adjuster)
         if found is not None:
             models["sfm"] = found
         errors = {method: adjuster.median_error(model) for method, model in models.items()}
@@ -153,7 +152,7 @@ class _Sfm(Features):
         share = _CONVINCING if errors[best] <= _EXPLAINED * adjuster.floor else _UNEXPLAINED
         if not 0 < errors[best] <= share * errors["given"]:
             return start, outcome.model_copy(update={"errors_px": errors})
-        model = self._with_points(models[best], self._matched if best == "sfm" else self._database)
+        model = self.with_points(models[best], self._matched if best == "sfm" else self.database)
         update = {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
         return model, outcome.model_copy(update={"errors_px": errors, **update})
 
@@ -161,9 +160,9 @@ class _Sfm(Features):
         """Return the convention whose poses fit the matches best; `OWN` if it fits, or if no other does."""
         if len(given) == 1:
             return OWN
-        matches = verified_matches(self._database)
-        cameras = colmap_cameras(self._job)
-        camera_of = {index + 1: cameras[number] for index, number in enumerate(self._job.camera_of)}
+        matches = verified_matches(self.database)
+        cameras = colmap_cameras(self.job)
+        camera_of = {index + 1: cameras[number] for index, number in enumerate(self.job.camera_of)}
         fits = {}
         for convention, matrices in given.items():
             poses = {index + 1: np.array(matrix) for index, matrix in enumerate(matrices)}
@@ -172,7 +171,7 @@ class _Sfm(Features):
         best = max(fits, key=lambda convention: fits[convention])
         return best if fits[OWN] < _FITS <= fits[best] else OWN
 
-    def _sfm_over(
+    def sfm_over(
         self, given: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]], judge: Adjuster
     ) -> tuple[pycolmap.Reconstruction | None, dict[str, str]]:
         """Return the model of structure from motion in the world of ``given``, and how frames were placed.
@@ -180,26 +179,26 @@ class _Sfm(Features):
         The last adjustment does not use the matches that ``judge`` kept out. The model is None if a frame has
         no pose.
         """
-        job = self._job
+        job = self.job
         guesses = [guessed_camera(FIRST_LENS, camera.width, camera.height) for camera in job.cameras]
         unknown = job.model_copy(update={"cameras": guesses})
-        set_cameras(self._database, colmap_cameras(unknown))
+        set_cameras(self.database, colmap_cameras(unknown))
         try:
-            model, placed = self._mapped(pairs)
+            model, placed = self.mapped(pairs)
         except StageError:
             return None, {}
         if model.num_reg_images() < len(job.names):
             return None, {}
         # Frames that were placed again have other features. The same tracks of all others are kept out.
-        same = self._matched == self._database
-        adjuster = judge if same else Adjuster(self._matched, self._with_points)
+        same = self._matched == self.database
+        adjuster = judge if same else Adjuster(self._matched, self.with_points)
         model = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
         lay_over(model, given, model.images.values())
         return model, placed
 
-    def _mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
+    def mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
         """Return the model of the images alone, and how frames were placed."""
-        model = self._rejoined(self._corrected(self._map(), self._database), self._database)
+        model = self._rejoined(self._corrected(self._map(), self.database), self.database)
         model, placed = self._place_the_rest(model, pairs)
         before = _names_in(model)
         model = self._corrected(self._rejoined(model, self._matched), self._matched)
@@ -253,7 +252,7 @@ class _Sfm(Features):
 
     def _map(self) -> pycolmap.Reconstruction:
         """Run incremental mapping. Return the model with the most registered frames (the first of equals)."""
-        total = len(self._job.names)
+        total = len(self.job.names)
         options = copy.deepcopy(self._options)
         options.min_model_size = min(_MIN_MODEL, max(3, total // 3))
         options.max_num_models = 5
@@ -270,9 +269,9 @@ class _Sfm(Features):
                 self._report(phase="adjusting all poses", total=None)
 
         models = pycolmap.incremental_mapping(
-            self._database,
-            self._job.images,
-            self._output,
+            self.database,
+            self.job.images,
+            self.output,
             options,
             initial_image_pair_callback=lambda: self._report(done=2),
             next_image_callback=placed,
@@ -293,8 +292,8 @@ class _Sfm(Features):
         It works in copies of the database, so that a killed run finds the first one unchanged. Returns the
         model, and for each image how it was placed or why it was not.
         """
-        names, reach = self._job.names, self._job.config.overlap
-        self._matched = self._database
+        names, reach = self.job.names, self.job.config.overlap
+        self._matched = self.database
         placed = dict.fromkeys(_names_in(model), FIRST.name)
         reasons: dict[str, str] = {}
         for settings in AGAIN:
@@ -304,10 +303,10 @@ class _Sfm(Features):
             again = set(missing)
             if settings.neighbours:
                 again = {i for i in range(len(names)) if any(abs(i - j) <= reach for j in missing)}
-            database = self._database.with_name(f"{settings.name.replace(' ', '-')}.db")
+            database = self.database.with_name(f"{settings.name.replace(' ', '-')}.db")
             copy_without_features(self._matched, database, [index + 1 for index in again])
-            self._extract(database, [names[index] for index in sorted(again)], settings)
-            self._match(database, [pair for pair in pairs if not again.isdisjoint(pair)], " again")
+            self.extract(database, [names[index] for index in sorted(again)], settings)
+            self.match(database, [pair for pair in pairs if not again.isdisjoint(pair)], " again")
             self._report(phase="placing frames again", total=None)
             found = self._continued(model, database, again, settings)
             if _names_in(found) > placed.keys():
@@ -329,19 +328,19 @@ class _Sfm(Features):
         for image in model.images.values():
             if image.image_id - 1 in again and image.has_pose:
                 kept.deregister_frame(image.frame_id)
-        start = self._output / "start"
+        start = self.output / "start"
         make_folder(start, empty=True)
         kept.write_binary(start)
         models = pycolmap.incremental_mapping(
-            database, self._job.images, self._output, options, input_path=start
+            database, self.job.images, self.output, options, input_path=start
         )
         return max([*models.values(), model], key=lambda model: model.num_reg_images())
 
-    def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
+    def triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
         """Return a model with points triangulated at the given poses and cameras, which do not change."""
         self._report(phase="triangulating", total=None)
         model = pycolmap.Reconstruction()
-        with pycolmap.Database.open(self._database) as opened:
+        with pycolmap.Database.open(self.database) as opened:
             for camera in opened.read_all_cameras():
                 model.add_camera_with_trivial_rig(camera)
             for image in sorted(opened.read_all_images(), key=lambda image: image.image_id):
@@ -349,13 +348,13 @@ class _Sfm(Features):
                     pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
                     pycolmap.Rigid3d(np.array(poses[image.image_id - 1])),
                 )
-        return self._with_points(model, self._database)
+        return self.with_points(model, self.database)
 
-    def _with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
+    def with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
         """Return ``model`` with points triangulated again from the matches in ``database``."""
         set_cameras(database, list(model.cameras.values()))  # COLMAP refuses a model whose lenses differ
         return pycolmap.triangulate_points(
-            model, database, self._job.images, self._output, options=self._options
+            model, database, self.job.images, self.output, options=self._options
         )
 
 

@@ -38,27 +38,27 @@ def with_first_part_scaled(poses: Poses, first: int, factor: float) -> Poses:
 
 
 @pytest.fixture
-def placer(images: Path, tmp_path: Path) -> sfm_worker._Sfm:
+def placer(images: Path, tmp_path: Path) -> sfm_worker.Sfm:
     """COLMAP's work on ten images, with matches."""
     work = tmp_path / "work"
     work.mkdir()
     frames = prepare(open_capture(images, CaptureConfig()), work, 320, SilentReporter())
     job = sfm.job_of(frames, None, work, SfmConfig(max_features=1024), 0, 1)
-    placer = sfm_worker._Sfm(job, lambda **_: None)
+    placer = sfm_worker.Sfm(job, lambda **_: None)
     pycolmap.set_random_seed(0)
-    create_database(placer._database, job)
-    placer._extract(placer._database, job.names, FIRST)
-    placer._match(placer._database, placer._pairs())
-    placer._output.mkdir()
+    create_database(placer.database, job)
+    placer.extract(placer.database, job.names, FIRST)
+    placer.match(placer.database, placer.pairs())
+    placer.output.mkdir()
     return placer
 
 
-def moved(placer: sfm_worker._Sfm, right: pycolmap.Reconstruction, poses: Poses) -> pycolmap.Reconstruction:
+def moved(placer: sfm_worker.Sfm, right: pycolmap.Reconstruction, poses: Poses) -> pycolmap.Reconstruction:
     """Return ``right`` at other poses, with its points triangulated there."""
     model = pycolmap.Reconstruction(right)
     for number, pose in poses.items():
         model.frames[model.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
-    return placer._with_points(model, placer._database)
+    return placer.with_points(model, placer.database)
 
 
 def off(model: pycolmap.Reconstruction, right: pycolmap.Reconstruction) -> list[float]:
@@ -72,39 +72,39 @@ def off(model: pycolmap.Reconstruction, right: pycolmap.Reconstruction) -> list[
     ]
 
 
-def test_a_part_at_another_scale_is_placed_again(placer: sfm_worker._Sfm) -> None:
+def test_a_part_at_another_scale_is_placed_again(placer: sfm_worker.Sfm) -> None:
     right = placer._map()
-    assert placer._rejoined(right, placer._database) is right
+    assert placer._rejoined(right, placer.database) is right
     poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}
     torn = moved(placer, right, with_first_part_scaled(poses, 4, 4.0))
-    image, share = weakest_join(torn, placer._database)
-    assert image == 4 and share < 0.6 and weakest_join(right, placer._database)[1] > 0.97
-    found = off(placer._rejoined(torn, placer._database), right)
+    image, share = weakest_join(torn, placer.database)
+    assert image == 4 and share < 0.6 and weakest_join(right, placer.database)[1] > 0.97
+    found = off(placer._rejoined(torn, placer.database), right)
     # The torn one is off by half its extent. Two adjustments of the same matches differ by a few per mille.
     assert len(found) == 10 and max(found) < 0.02 and placer._torn_at is None
 
 
 def test_a_frame_that_contradicts_its_matches_is_placed_again_or_left_out(
-    placer: sfm_worker._Sfm, monkeypatch: pytest.MonkeyPatch
+    placer: sfm_worker.Sfm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = placer._map()
-    assert placer._corrected(right, placer._database) is right
+    assert placer._corrected(right, placer.database) is right
     poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}
     away = poses[5].copy()
     away[:, 3] += 0.5 * np.ptp([pose[:, 3] for pose in poses.values()], axis=0).max()
     wrong = moved(placer, right, {5: away})
-    shares = fitting_shares(wrong, verified_matches(placer._database))
+    shares = fitting_shares(wrong, verified_matches(placer.database))
     others = [share for number, share in shares.items() if number != 5]
     assert shares[5] < 0.5 < 0.6 < min(others)  # measured: 0.29 and 0.88
-    found = off(placer._corrected(wrong, placer._database), right)
+    found = off(placer._corrected(wrong, placer.database), right)
     assert len(found) == 10 and max(found) < 0.02
     monkeypatch.setattr(placer, "_continued", lambda model, *others: model)
-    left = placer._corrected(wrong, placer._database)
+    left = placer._corrected(wrong, placer.database)
     assert sfm_worker._names_in(right) - sfm_worker._names_in(left) == {right.images[5].name}
 
 
 def test_no_frame_is_left_out_where_more_than_a_tenth_contradict_their_matches(
-    placer: sfm_worker._Sfm, monkeypatch: pytest.MonkeyPatch
+    placer: sfm_worker.Sfm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = placer._map()
     poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}
@@ -112,10 +112,10 @@ def test_no_frame_is_left_out_where_more_than_a_tenth_contradict_their_matches(
     for sign, pose in zip((1.0, -1.0), away.values(), strict=True):
         pose[:, 3] += sign * 0.5 * np.ptp([pose[:, 3] for pose in poses.values()], axis=0).max()
     wrong = moved(placer, right, away)
-    shares = fitting_shares(wrong, verified_matches(placer._database))
+    shares = fitting_shares(wrong, verified_matches(placer.database))
     assert sorted(number for number, share in shares.items() if share < 0.6) == [5, 8]
     monkeypatch.setattr(placer, "_continued", lambda model, *others: model)
-    assert placer._corrected(wrong, placer._database).num_reg_images() == 10
+    assert placer._corrected(wrong, placer.database).num_reg_images() == 10
 
 
 def test_a_join_that_stays_wrong_is_named(

@@ -14,21 +14,21 @@ from cleargs.capture.config import SfmConfig
 NAMES = [f"{index:02d}.png" for index in range(12)]
 
 
-class Placer(sfm_worker._Sfm):
+class Placer(sfm_worker.Sfm):
     """Maps by a script: the numbers of the frames that each try has placed at its end."""
 
     def __init__(self, tries: list[set[int]]) -> None:
-        self._job = cast(Any, SimpleNamespace(names=NAMES, config=SfmConfig(overlap=2)))
+        self.job = cast(Any, SimpleNamespace(names=NAMES, config=SfmConfig(overlap=2)))
         self._report = lambda **_: None
-        self._database = Path("database.db")
+        self.database = Path("database.db")
         self._tries = iter(tries)
         self.extracted: list[list[str]] = []
         self.matched: list[int] = []
 
-    def _extract(self, database: Path, names: Any, settings: Any) -> None:
+    def extract(self, database: Path, names: Any, settings: Any) -> None:
         self.extracted.append(list(names))
 
-    def _match(self, database: Path, pairs: Any, again: str = "") -> None:
+    def match(self, database: Path, pairs: Any, again: str = "") -> None:
         self.matched.append(len(pairs))
 
     def _continued(self, model: Any, database: Path, again: set[int], settings: Any) -> Any:
