@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cleargs.capture import sfm_worker
-from cleargs.capture.adjustment import FULL_LENS, Adjuster, lay_over, median_residual, set_lens
+from cleargs.capture.adjustment import FULL_LENS, Adjuster, align_to, median_residual, set_lens
 from cleargs.capture.cameras import Pose, normalise, pinhole
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import CaptureConfig, SfmConfig
@@ -160,7 +160,7 @@ def _off(model: pycolmap.Reconstruction, true: Sequence[Pose]) -> float:
         pose = true[image.image_id - 1]
         matrix = np.column_stack([pose.rotation, pose.translation])
         known.frames[image.frame_id].rig_from_world = pycolmap.Rigid3d(matrix)
-    lay_over(laid, known, [image for image in laid.images.values() if image.has_pose])
+    align_to(laid, known, [image for image in laid.images.values() if image.has_pose])
     off = [image.projection_center() - true[image.image_id - 1].centre for image in laid.images.values()]
     return float(np.median(np.linalg.norm(off, axis=1)))
 

@@ -116,24 +116,24 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         )
         trainings.append(consolidated.folder)
 
-    verdict = check_harm(
+    checked = check_harm(
         g0, consolidated, supervision, scorer, harm, threads, repaired=any(row.accepted for row in rows)
     )
-    final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)
+    final, rejected = (consolidated, None) if checked.harm is None else (start, consolidated)
     if rejected is not None:
         reporter.warn(
-            f"the consolidated scene is rejected, RIVR's stays: {verdict.harm} on the held-back frames"
+            f"the consolidated scene is rejected, RIVR's stays: {checked.harm} on the control frames"
         )
     publish(final, trainings, context.out, rejected)
 
-    better = "consolidated scene" if verdict.harm is None else "RIVR's scene"
+    better = "consolidated scene" if checked.harm is None else "RIVR's scene"
     return StageResult(
         summary={
             "repairs": len(repairs),
             "chosen": tables.chosen_counts(repairs) | {"observed": len(unrepaired)},
             "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
             "scorer": scorer.name,
-            "held_back": asdict(verdict),
+            "held_back": asdict(checked),
             "published": better if repairs or kept else "G0",
             "psnr_unseen": final.psnr_unseen(supervision.real),
         }

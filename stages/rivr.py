@@ -224,17 +224,17 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         )
 
     repaired = any(row.accepted for row in rows)
-    verdict = check_harm(g0, current, supervision, rules.primary, config.harm, threads, repaired=repaired)
-    if verdict.harm is not None:
-        reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")
-    final, rejected = (current, None) if verdict.harm is None else (g0, current)
+    checked = check_harm(g0, current, supervision, rules.primary, config.harm, threads, repaired=repaired)
+    if checked.harm is not None:
+        reporter.warn(f"the distilled scene is rejected, G0 stays: {checked.harm} on the control frames")
+    final, rejected = (current, None) if checked.harm is None else (g0, current)
     publish(final, trainings, context.out, rejected)
     return StageResult(
         summary={
             "expert": expert.name,
             "rounds": [round_figures(number, rows) for number in sorted({row.round for row in rows})],
-            "held_back": asdict(verdict),
-            "published": "distilled scene" if verdict.harm is None else "G0",
+            "held_back": asdict(checked),
+            "published": "distilled scene" if checked.harm is None else "G0",
             "psnr_unseen": final.psnr_unseen(supervision.real),
         }
     )

@@ -80,7 +80,7 @@ def test_every_artifact_is_there_to_inspect(finished: Path) -> None:
     rva = pq.read_table(finished / "rva" / "frames.parquet").to_pylist()
     assert len(rva) == 8 and any(row["weight"] > 0.8 for row in rva)
     selection = pq.read_table(finished / "rivr" / "selection.parquet").to_pylist()
-    # One strong frame is not repaired: it is the judge of harm.
+    # One strong frame is not repaired: it is the control frame.
     targets = sum(frame["registered"] for frame in frames) - 1
     tried = [row for row in selection if row["exr"] is not None]
     assert len(tried) == 2 * targets

@@ -98,10 +98,10 @@ def test_train_a_scene(
     assert cg.load(made).gaussians.num >= 5000 and cg.load(made).gaussians.sh_degree == 1
 
 
-def test_judge_frames(
+def test_rate_frames(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = example("judge_frames.py", monkeypatch, capsys, place / "room" / "images", place / "best.png")
+    out = example("rate_frames.py", monkeypatch, capsys, place / "room" / "images", place / "best.png")
     assert out.count("reliability") == 8 and (place / "best.png").is_file()
 
 

@@ -9,7 +9,7 @@ from benchmarks.comparison.cells import Cells, Spread, ViewSet
 from benchmarks.comparison.tables import COMPARED, NAMES, Bold, Table, difference_text
 from cleargs.evaluate.eval_report import LOWER_IS_BETTER
 
-VERDICTS = ("significant", "one sample", "none")
+SIGNIFICANCE = ("significant", "one sample", "none")
 """Significance of a difference: its 95 % interval excludes 0, there is no interval, or it includes 0."""
 
 
@@ -24,8 +24,8 @@ class Gap:
     difference: Spread
 
     @property
-    def verdict(self) -> str:
-        """One of `VERDICTS`."""
+    def significance(self) -> str:
+        """One of `SIGNIFICANCE`."""
         if self.difference.half_width is None:
             return "one sample"
         return "significant" if self.difference.excludes_zero else "none"
@@ -45,7 +45,7 @@ def compared_with(cells: Cells, variant: str) -> Iterator[Gap]:
 def losses_of(cells: Cells, variant: str) -> list[Gap]:
     """Return the cells in which ``variant`` is worse, significant differences first."""
     found = [loss for loss in compared_with(cells, variant) if is_worse(loss.difference, loss.metric)]
-    return sorted(found, key=lambda loss: VERDICTS.index(loss.verdict))
+    return sorted(found, key=lambda loss: SIGNIFICANCE.index(loss.significance))
 
 
 def is_worse(difference: Spread, metric: str) -> bool:
@@ -64,7 +64,7 @@ def losses_table(places: Sequence[str], found: Iterable[tuple[tuple[str, ...], G
     for place, loss in found:
         text = difference_text(loss.difference, None, loss.metric)
         row = rows.setdefault(place, [""] * len(COMPARED))
-        row[COMPARED.index(loss.metric)] = Bold(text) if loss.verdict == "significant" else text
+        row[COMPARED.index(loss.metric)] = Bold(text) if loss.significance == "significant" else text
     return Table(
         [*places, *(NAMES[metric] for metric in COMPARED)], [[*place, *row] for place, row in rows.items()]
     )

@@ -150,7 +150,7 @@ def _subject_facts(cells: Cells, labels: Mapping[str, str], subject: str) -> dic
         "subject": labels[subject],
         "pairs": sum(1 for _ in compared_with(cells, subject)),
         "behind": len(found),
-        "verdicts": Counter(loss.verdict for loss in found),
+        "significance": Counter(loss.significance for loss in found),
         "losses": losses_table(("capture", "views", "worse than"), places),
     }
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmarks.comparison.cells import Cells, ViewSet
 from benchmarks.comparison.evidence import Section
 from benchmarks.comparison.front_page import FAULTS
-from benchmarks.comparison.gaps import VERDICTS, Gap, compared_with, is_worse, losses_table
+from benchmarks.comparison.gaps import SIGNIFICANCE, Gap, compared_with, is_worse, losses_table
 from benchmarks.comparison.saved_sections import SavedSection
 from benchmarks.comparison.tables import (
     COMPARED,
@@ -152,14 +152,14 @@ def _without_alignment(saved: Sequence[SavedSection]) -> list[SavedSection]:
 def losses(saved: Sequence[SavedSection]) -> list[tuple[str, Gap]]:
     """Return the comparisons in which the whole method is worse, significant differences first."""
     found = [(section, gap) for section, gap in gaps(saved) if is_worse(gap.difference, gap.metric)]
-    return sorted(found, key=lambda item: VERDICTS.index(item[1].verdict))
+    return sorted(found, key=lambda item: SIGNIFICANCE.index(item[1].significance))
 
 
 def losses_found(saved: Sequence[SavedSection]) -> str:
     """Return the table of losses and a line with their number."""
     found, labels = losses(saved), _labels()
     compared = len(gaps(saved))
-    significant = sum(loss.verdict == "significant" for _, loss in found)
+    significant = sum(loss.significance == "significant" for _, loss in found)
     line = f"Worse in {len(found)} of {compared} comparisons, significantly in {significant} of them."
     places = [
         ((section, loss.column, TITLES[loss.views].split(",")[0], labels[loss.against]), loss)

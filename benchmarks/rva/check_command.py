@@ -78,26 +78,26 @@ def _check(run: Path, dag: Dag) -> Check:
         raise InputError(
             f"the capture {source} has no {TRUTH}", hint="give runs on captures made by `cleargs synth`"
         )
-    judged = read_table((run / "rva").resolve() / "frames.parquet", FRAMES)
+    rated = read_table((run / "rva").resolve() / "frames.parquet", FRAMES)
     true = read_table(source / TRUTH, TRUE_FRAMES)
     row = {Path(image).name: k for k, image in enumerate(true["image"].to_pylist())}
-    names = [Path(name).name for name in judged["name"].to_pylist()]
+    names = [Path(name).name for name in rated["name"].to_pylist()]
     absent = [name for name in names if name not in row]
     if absent:
         raise InputError(
             f"{absent[0]} is not in {source / TRUTH}",
             hint="the capture changed: repeat the run, or rebuild the capture",
         )
-    scored = np.flatnonzero(~np.isnan(np.asarray(judged["R"].to_numpy(), dtype=np.float64)))
+    scored = np.flatnonzero(~np.isnan(np.asarray(rated["R"].to_numpy(), dtype=np.float64)))
     order = np.array([row[names[k]] for k in scored], dtype=np.intp)
 
     def column(name: str) -> ArrayF64:
-        return np.asarray(judged[name].to_numpy(), dtype=np.float64)[scored]
+        return np.asarray(rated[name].to_numpy(), dtype=np.float64)[scored]
 
     return check(
         column("R"),
         column("B"),
         {f"b_{name}": column(f"b_{name}") for name in B_CUES},
-        np.asarray(judged["reliable"].to_numpy(), dtype=bool)[scored],
+        np.asarray(rated["reliable"].to_numpy(), dtype=bool)[scored],
         Faults(*(true[name].to_numpy()[order] for name in ("blur_px", "defocus_px", "exposure_ev"))),
     )

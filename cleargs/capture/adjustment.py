@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import copy_without_features
-from cleargs.capture.judging import epipolar_errors, keep_out
+from cleargs.capture.kept_out import epipolar_errors, keep_out
 
 FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
 """Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
@@ -170,7 +170,7 @@ def _median(errors: NDArray[np.float64]) -> float:
     return float(np.median(errors)) if len(errors) else 0.0
 
 
-def lay_over(
+def align_to(
     model: pycolmap.Reconstruction, given: pycolmap.Reconstruction, held: Collection[pycolmap.Image]
 ) -> None:
     """Transform ``model`` by the similarity that maps its images ``held`` best to the cameras of ``given``.
@@ -202,7 +202,7 @@ def _anchored(
 
     The features do not determine position, rotation and scale of the whole. Both models have the same frames.
     """
-    lay_over(model, given, held)
+    align_to(model, given, held)
     names = {image.name for image in held}
     poses = {image.name: image.cam_from_world() for image in given.images.values() if image.has_pose}
     for image in model.images.values():

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cleargs.capture.adjustment import FIRST_LENS, SHARED_BY, Adjuster, lay_over, lens_of, median_residual
+from cleargs.capture.adjustment import FIRST_LENS, SHARED_BY, Adjuster, align_to, lens_of, median_residual
 from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
@@ -31,7 +31,7 @@ from cleargs.capture.database import (
     set_cameras,
     why_missing,
 )
-from cleargs.capture.judging import epipolar_errors, fitting_shares, verified_matches, weakest_join
+from cleargs.capture.kept_out import epipolar_errors, fitting_shares, verified_matches, weakest_join
 from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
 from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
@@ -172,12 +172,12 @@ class Sfm(Features):
         return best if fits[OWN] < _FITS <= fits[best] else OWN
 
     def sfm_over(
-        self, given: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]], judge: Adjuster
+        self, given: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]], adjuster: Adjuster
     ) -> tuple[pycolmap.Reconstruction | None, dict[str, str]]:
         """Return the model of structure from motion in the world of ``given``, and how frames were placed.
 
-        The last adjustment does not use the matches that ``judge`` kept out. The model is None if a frame has
-        no pose.
+        The last adjustment does not use the matches that ``adjuster`` keeps out. The model is None if a frame
+        has no pose.
         """
         job = self.job
         guesses = [guessed_camera(FIRST_LENS, camera.width, camera.height) for camera in job.cameras]
@@ -190,10 +190,10 @@ class Sfm(Features):
         if model.num_reg_images() < len(job.names):
             return None, {}
         # Frames that were placed again have other features. The same tracks of all others are kept out.
-        same = self._matched == self.database
-        adjuster = judge if same else Adjuster(self._matched, self.with_points)
+        if self._matched != self.database:
+            adjuster = Adjuster(self._matched, self.with_points)
         model = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
-        lay_over(model, given, model.images.values())
+        align_to(model, given, model.images.values())
         return model, placed
 
     def mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:

@@ -57,7 +57,7 @@ LABELS: Mapping[str, str] = {
     "repairs_refused": "repairs refused by the gate",
     "tie_breaks": "choices by the tie-break scorer",
     "latest_rounds": "repairs by round",
-    "held_back": "judges",
+    "held_back": "control frames",
 }
 """Figure of a manifest -> its label, if its name is not clear."""
 
@@ -233,16 +233,16 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
     if number not in rows:
         raise InputError(f"{run} has no frame {number}", hint=f"choose one from {min(rows)} to {max(rows)}")
     row = rows[number]
-    frame, judged, repairs = row.frame, dict(row.judged), []
-    if judged:
-        judged |= {"reason": reason(judged, done["rva"].parts.config), "worst_cue": worst_cue(judged)}
+    frame, rated, repairs = row.frame, dict(row.rated), []
+    if rated:
+        rated |= {"reason": reason(rated, done["rva"].parts.config), "worst_cue": worst_cue(rated)}
     if "consolidate" in done:
         repairs = read_table(run / "consolidate/repairs.parquet", REPAIRS).to_pylist()
     formation = row.formation.items()
     facts = {
         **asdict(frame),
         "centre": camera_of(frame).centre.tolist() if frame.registered else None,
-        "rva": judged or None,
+        "rva": rated or None,
         "exposure_stops": row.gain_ev,
         "formation": {name: {"value": value, "meaning": MEANINGS.get(name, "")} for name, value in formation},
         "rounds": [asdict(found) for found in row.rounds],
@@ -284,7 +284,7 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
     """Yield label and text of each line about a frame. ``--json`` prints more facts."""
     from cleargs.report.frames import CHOICES, EFFECTS, scores_of
 
-    frame, judged = row.frame, facts["rva"]
+    frame, rated = row.frame, facts["rva"]
     yield "file", frame.name
     if frame.time_s is not None:
         yield "time", f"{frame.time_s:.2f} s"
@@ -295,11 +295,11 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
         yield "pose", f"camera at ({centre}), sees {frame.n_points} sparse points"
     else:
         yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
-    if judged:
-        yield "role", f"{judged['role']}, weight {row.weight:.2f}: {judged['reason']}"
-        known = ((name, judged[name]) for name in ("R", "B", "G") if judged[name] is not None)
+    if rated:
+        yield "role", f"{rated['role']}, weight {row.weight:.2f}: {rated['reason']}"
+        known = ((name, rated[name]) for name in ("R", "B", "G") if rated[name] is not None)
         yield "scores", ", ".join(f"{name} {value:.2f}" for name, value in known)
-        yield "worst cue", judged["worst_cue"] or "none"
+        yield "worst cue", rated["worst_cue"] or "none"
     if found := row.formation:
         if found["model"] == "none":
             yield "formation", "nothing found"

@@ -335,7 +335,7 @@ def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, Ma
     image, stencil = way.image(image), None if stencil is None else way.mask(stencil)
     if min(image.shape[:2]) < MIN_SIDE:
         raise InputError(
-            f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels: too small to be judged",
+            f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels: too small to be compared",
             hint=f"give references of at least {MIN_SIDE} pixels on each side",
         )
     return image, None if stencil is None else stencil > 0

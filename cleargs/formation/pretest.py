@@ -114,7 +114,7 @@ def _fitted(
         """Return the squared error on unseen tiles, and the mean of the numbers [7]."""
         numbers = [_solved(fitting, shape) for fitting, _ in halves]
         left = [np.append(x, -1.0) for x in numbers]
-        errors = [float(x @ judging @ x) for (_, judging), x in zip(halves, left, strict=True)]
+        errors = [float(x @ unseen @ x) for (_, unseen), x in zip(halves, left, strict=True)]
         return math.fsum(errors), np.mean(numbers, axis=0)
 
     still = np.eye(_ALL)[:, :_STILL]

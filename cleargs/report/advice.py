@@ -26,7 +26,7 @@ from cleargs.program import program
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
-from cleargs.report.verdict import figure_of
+from cleargs.report.outcome import figure_of
 from cleargs.splat.config import steps_from_frames
 
 FEW_PLACED = 0.8

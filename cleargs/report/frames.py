@@ -57,7 +57,7 @@ class FrameRow:
     """One frame, with the results of the stages for it."""
 
     frame: Frame
-    judged: Mapping[str, Any] = field(default_factory=dict)
+    rated: Mapping[str, Any] = field(default_factory=dict)
     """The row of the frame in ``rva/frames.parquet``; empty without one."""
     rounds: tuple[Selection, ...] = ()
     """The rows of the frame in ``rivr/selection.parquet``, in the order of the rounds."""
@@ -76,16 +76,16 @@ class FrameRow:
         """Role by RVA, `HELD_OUT` or `UNPLACED`; "" if it is unknown."""
         if not self.frame.registered:
             return UNPLACED
-        return HELD_OUT if self.frame.split != "train" else str(self.judged.get("role", ""))
+        return HELD_OUT if self.frame.split != "train" else str(self.rated.get("role", ""))
 
     @property
     def weight(self) -> float | None:
         """Weight of the raw frame at the end of the training, from 0 to 1; None if it is unknown."""
-        weight: float | None = self.formation.get("weight_after", self.judged.get("weight"))
+        weight: float | None = self.formation.get("weight_after", self.rated.get("weight"))
         return weight
 
     @property
-    def teaching(self) -> str:
+    def weight_text(self) -> str:
         """The weight of the raw frame in words, with its reason; "" if it is unknown."""
         if self.role in (UNPLACED, HELD_OUT):
             return f"{self.role}: not used"
@@ -96,7 +96,7 @@ class FrameRow:
         if self.modelled:
             effect, size = EFFECTS[self.formation["model"]]
             return f"{effect} {self.formation[size]:.1f} px, simulated: {counts}"
-        fault = worst_cue(self.judged)
+        fault = worst_cue(self.rated)
         return f"{fault}: {counts}" if fault and self.weight < 0.995 else counts
 
     @property
@@ -129,20 +129,20 @@ class FrameRow:
         return found
 
 
-def worst_cue(judged: Mapping[str, Any]) -> str:
+def worst_cue(rated: Mapping[str, Any]) -> str:
     """Return the largest fault of a row of ``rva/frames.parquet``, from 0 (good) to 1, as "blur 0.82".
 
     A low quality counts as a fault too, as "low sharpness 0.94". "" if no fault reaches `MIN_FAULT`.
     """
-    faults = faults_of(judged)
+    faults = faults_of(rated)
     name = max(faults, key=lambda name: faults[name], default="")
     return f"{name} {faults[name]:.2f}" if name and faults[name] >= MIN_FAULT else ""
 
 
-def faults_of(judged: Mapping[str, Any]) -> dict[str, float]:
+def faults_of(rated: Mapping[str, Any]) -> dict[str, float]:
     """Return the cues of a row of ``rva/frames.parquet`` as faults, from 0 (good) to 1 (bad)."""
-    lacking = {f"low {name}": judged.get(f"r_{name}") for name in R_CUES}
-    harms = {name.replace("_", " "): judged.get(f"b_{name}") for name in B_CUES}
+    lacking = {f"low {name}": rated.get(f"r_{name}") for name in R_CUES}
+    harms = {name.replace("_", " "): rated.get(f"b_{name}") for name in B_CUES}
     faults = {name: 1.0 - value for name, value in lacking.items() if value is not None}
     return faults | {name: value for name, value in harms.items() if value is not None}
 
@@ -180,10 +180,10 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
 
     Raises StoreError if a table cannot be read.
     """
-    judged: dict[int, dict[str, Any]] = {}
+    rated: dict[int, dict[str, Any]] = {}
     if "rva" in stages:
         rows = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
-        judged = {row["frame_id"]: row for row in rows}
+        rated = {row["frame_id"]: row for row in rows}
     rounds: dict[int, list[Selection]] = {}
     if "rivr" in stages:
         for found in sorted(read_selection(run / "rivr" / "selection.parquet"), key=lambda row: row.round):
@@ -203,7 +203,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     return [
         FrameRow(
             frame,
-            judged.get(frame.frame_id, {}),
+            rated.get(frame.frame_id, {}),
             tuple(rounds.get(frame.frame_id, ())),
             affines.get(frame.frame_id),
             formation.get(frame.frame_id, {}),

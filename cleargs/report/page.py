@@ -37,10 +37,10 @@ from cleargs.report.frames import (
     scores_of,
     worst_cue,
 )
+from cleargs.report.outcome import outcome
 from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
 from cleargs.report.report_json import ENTRY, PAGE, cameras_of, linked_manifests, page_of, write_report_json
 from cleargs.report.single_file import single_file_size
-from cleargs.report.verdict import verdict
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
@@ -118,7 +118,7 @@ def write_report(planner: Planner) -> Path:
             name=run.name,
             source=planner.run.source.name,
             pictures=pictures,
-            verdict=verdict(manifests, rows, unseen),
+            outcome=outcome(manifests, rows, unseen),
             advice=shown_advice(planner, manifests, rows),
             scene=scene,
             films=sorted(file.name for file in run.glob("*.mp4")),
@@ -200,11 +200,11 @@ def frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> di
         "name": row.frame.name,
         "role": row.role,
         "weight": row.weight,
-        "teaching": row.teaching,
+        "weight_text": row.weight_text,
         "psnr": row.psnr if pictures.psnr is None else pictures.psnr,
-        "figures": {name: row.judged[name] for name in "RBGCDOZ" if row.judged.get(name) is not None},
-        "worst": worst_cue(row.judged),
-        "cues": dict(sorted(faults_of(row.judged).items(), key=lambda item: -item[1])),  # the worst first
+        "figures": {name: row.rated[name] for name in "RBGCDOZ" if row.rated.get(name) is not None},
+        "worst": worst_cue(row.rated),
+        "cues": dict(sorted(faults_of(row.rated).items(), key=lambda item: -item[1])),  # the worst first
         "repair": repair,
         "why": why,
         "chosen": row.chosen,

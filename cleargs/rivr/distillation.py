@@ -36,7 +36,7 @@ from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import hide_masked
-from cleargs.rivr.harm import Fidelity, HarmConfig, HarmVerdict, judge_harm
+from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, harm_of
 from cleargs.rivr.targets import Supervision
 from cleargs.splat.backend import backend_for, psnr, rasteriser_for
 from cleargs.splat.camera import Camera
@@ -194,25 +194,25 @@ class TrainedScene:
 
     def fidelity(
         self,
-        holdout: Sequence[TrainingView],
+        controls: Sequence[TrainingView],
         scorer: Scorer,
         threads: int,
         before: TrainedScene | None = None,
     ) -> Fidelity | None:
-        """Return the agreement of the scene with the frames held out from repair; None without any.
+        """Return the agreement of the scene with the control frames; None without any.
 
         Pixels that move do not count: those of the scene ``before``, to compare with, or else of this scene.
         For PSNR, the render has the motion of the frame, since a sharp scene is not wrong because raw frames
         are blurred and skewed by the camera's motion.
         """
         values, scores = [], []
-        for view in holdout:
+        for view in controls:
             render, (observed, mask) = self.render(view), observation(view)
             mask = (before or self).still(view, mask)
             counted = None if mask is None else torch.from_numpy(mask)
             values.append(psnr(self._render_observed(view), torch.from_numpy(observed), counted))
             scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))
-        return Fidelity(fmean(values), fmean(scores)) if holdout else None
+        return Fidelity(fmean(values), fmean(scores)) if controls else None
 
     def trained(
         self,
@@ -291,15 +291,15 @@ def check_harm(
     threads: int,
     *,
     repaired: bool,
-) -> HarmVerdict:
-    """Compare ``trained`` with ``g0`` on the frames held out from repair.
+) -> HarmCheck:
+    """Compare ``trained`` with ``g0`` on the control frames.
 
     Without ``repaired`` views the scene was trained on raw frames only, as G0 was. No repair can have done
     harm then, so nothing is rendered or scored.
     """
-    views = [supervision.views[frame_id] for frame_id in supervision.holdout_ids] if repaired else []
+    views = [supervision.views[frame_id] for frame_id in supervision.controls] if repaired else []
     before, after = g0.fidelity(views, scorer, threads), trained.fidelity(views, scorer, threads, g0)
-    return judge_harm(supervision.holdout_ids, before, after, limits)
+    return harm_of(supervision.controls, before, after, limits)
 
 
 def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected: TrainedScene | None) -> None:

@@ -12,7 +12,7 @@ from cleargs.base_model import FrozenModel
 
 
 class HarmConfig(FrozenModel):
-    """Margins beyond which a distilled scene is worse than G0 on the frames held out from repair.
+    """Margins beyond which a distilled scene is worse than G0 on the control frames.
 
     These frames remain in the raw supervision, as for G0. Otherwise the distilled scene would be measured on
     unseen frames: PSNR falls by 2 to 3 dB while the scene gains 0.9 dB against the truth (16 frames,
@@ -23,15 +23,15 @@ class HarmConfig(FrozenModel):
         0.125,
         ge=0.0,
         le=1.0,
-        description="share of the reliable frames (at least one) that get no repair and judge the result; "
-        "0: every frame may be repaired and nothing is rejected, the paper's way.",
+        description="control frames: this share of the reliable frames (at least one) gets no repair and "
+        "measures harm; 0: every frame may be repaired and nothing is rejected, the paper's way.",
     )
     psnr_margin: float = Field(0.5, ge=0.0, le=100.0, description="mean PSNR may fall by this much, dB")
     score_margin: float = Field(1.0, ge=0.0, le=100.0, description="mean primary score may fall by this much")
 
 
 class Fidelity(NamedTuple):
-    """Agreement of a scene with the frames held out from repair: means over them."""
+    """Agreement of a scene with the control frames: means over them."""
 
     psnr: float
     """PSNR of a frame's render, with the frame's motion, against its raw observation, dB."""
@@ -40,11 +40,11 @@ class Fidelity(NamedTuple):
 
 
 @dataclass(frozen=True)
-class HarmVerdict:
+class HarmCheck:
     """The decision about a distilled scene, with the figures behind it."""
 
     frames: list[int]
-    """The frames held out from repair. Without any, every scene is published."""
+    """The control frames. Without any, every scene is published."""
     psnr_before: float | None
     psnr_after: float | None
     score_before: float | None
@@ -53,20 +53,20 @@ class HarmVerdict:
     """The figure that fell by more than its margin; None if the distilled scene is published."""
 
 
-def judge_harm(
+def harm_of(
     frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
-) -> HarmVerdict:
-    """Compare a distilled scene with G0 on ``frames`` held out from repair; without any there is no harm.
+) -> HarmCheck:
+    """Compare a distilled scene with G0 on the control frames ``frames``; without any there is no harm.
 
     Harm is a fall of the mean PSNR or of the mean primary score by more than its margin: repairs may neither
     bend the scene away from its best observations nor soften it.
     """
     if before is None or after is None:
-        return HarmVerdict([], None, None, None, None, harm=None)
+        return HarmCheck([], None, None, None, None, harm=None)
     worse = []
     if after.psnr < before.psnr - limits.psnr_margin:
         worse.append(f"PSNR fell by {before.psnr - after.psnr:.2f} dB")
     if after.score < before.score - limits.score_margin:
         worse.append(f"primary score fell by {before.score - after.score:.2f}")
     harm = " and ".join(worse) or None
-    return HarmVerdict(list(frames), before.psnr, after.psnr, before.score, after.score, harm)
+    return HarmCheck(list(frames), before.psnr, after.psnr, before.score, after.score, harm)

@@ -29,7 +29,7 @@ MIN_SHARE, MIN_TRIED = 1 / 16, 2
 def frames_to_repair(
     which: Targets, supervision: Supervision, formations: Mapping[int, FrameFormation]
 ) -> list[int]:
-    """Return the frames that every round repairs, by frame_id; never one that is held out from repair.
+    """Return the frames that every round repairs, by frame_id; never a control frame.
 
     ``which`` is ``all``, or ``auto``: those in need by the ``formations`` of the last training, and the next
     ones up to a sixteenth of the frames.
@@ -64,7 +64,7 @@ def rows_of_others(
 
 
 def _reason_to_keep(frame_id: int, supervision: Supervision, formation: FrameFormation | None) -> str:
-    if frame_id in supervision.holdout_ids:
+    if frame_id in supervision.controls:
         return "not tried: it measures harm"
     if formation is not None and formation.model != "none":
         return f"not tried: {EXPLAINED}{described(formation)}"

@@ -33,8 +33,8 @@ class FrameAssessment:
     """Weight of the frame's raw supervision; a frame of weight 0 is never loaded."""
 
 
-def select_holdout(frames: Sequence[FrameAssessment], share: float = 0.125) -> list[int]:
-    """Select the frames that are held out from repair and measure harm by the repairs of others, in order.
+def select_controls(frames: Sequence[FrameAssessment], share: float = 0.125) -> list[int]:
+    """Select the control frames, which get no repair and measure harm by the repairs of others, in order.
 
     They are a ``share`` (at least one; none for 0) of the reliable frames, or of the stand-ins if there are
     none. These are divided, in order, into that many nearly equal parts. The best frame of each part by R - B
@@ -89,21 +89,21 @@ class Supervision:
 
     views: dict[int, TrainingView]
     assessments: list[FrameAssessment]
-    holdout_ids: list[int]
-    """Frames that are held out from repair and measure the harm by the repairs of others."""
+    controls: list[int]
+    """Control frames, which get no repair and measure the harm by the repairs of others."""
 
     @property
     def real(self) -> list[TrainingView]:
-        """The active raw frames D_real, including those held out from repair, as for G0."""
+        """The active raw frames D_real, including the control frames, as for G0."""
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property
     def candidates(self) -> list[FrameAssessment]:
-        """The frames that may be repaired: all except those held out from repair."""
-        return [frame for frame in self.assessments if frame.frame_id not in self.holdout_ids]
+        """The frames that may be repaired: all except the control frames."""
+        return [frame for frame in self.assessments if frame.frame_id not in self.controls]
 
 
-def load_supervision(ingest: Path, rva: Path, holdout_share: float) -> Supervision:
+def load_supervision(ingest: Path, rva: Path, share: float) -> Supervision:
     """Read the finished folders of ingest and rva, without frames that RVA could not score. Decode no image.
 
     Raises:
@@ -116,9 +116,9 @@ def load_supervision(ingest: Path, rva: Path, holdout_share: float) -> Supervisi
     scored = [row for row in rows if row.frame_id in frames and row.R is not None]
     assessments = sorted(scored, key=lambda frame: frame.frame_id)
     views = {a.frame_id: view_of(frames[a.frame_id], ingest, a.weight) for a in assessments}
-    holdout_ids = select_holdout(assessments, holdout_share)
-    if holdout_share > 0.0 and not holdout_ids:
+    controls = select_controls(assessments, share)
+    if share > 0.0 and not controls:
         raise StageError(
             "no frame is reliable, and no frame takes the place of one", hint="run rva again with --force rva"
         )
-    return Supervision(views, assessments, holdout_ids)
+    return Supervision(views, assessments, controls)

@@ -182,13 +182,15 @@ def found(*gains: float, version: str = "0.1.0, abc") -> SavedSection:
 def test_losses_are_sorted_by_significance() -> None:
     ((section, loss),) = losses([found(-1.0, -1.1, -0.9)])
     assert section == "Motion blur"
-    assert (loss.against, loss.metric, loss.verdict) == ("all-view", "psnr", "significant")
+    assert (loss.against, loss.metric, loss.significance) == ("all-view", "psnr", "significant")
     ((_, chance),) = losses([found(-1.0, 0.5, -0.2)])
-    assert chance.verdict == "none"
+    assert chance.significance == "none"
     ((_, single),) = losses([found(-1.0)])
-    assert single.verdict == "one sample"
+    assert single.significance == "one sample"
     assert losses([found(1.0, 1.1, 0.9)]) == []
-    ordered = [loss.verdict for _, loss in losses([found(-1.0, 0.5), found(-1.5), found(-1.0, -1.1, -0.9)])]
+    ordered = [
+        loss.significance for _, loss in losses([found(-1.0, 0.5), found(-1.5), found(-1.0, -1.1, -0.9)])
+    ]
     assert ordered == ["significant", "one sample", "none"]
 
 

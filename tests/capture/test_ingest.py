@@ -357,7 +357,7 @@ def test_few_registered_frames_fail_or_warn(images: Path, ingest: Ingest) -> Non
     assert [frame.placed for frame in load_frames(done.out)] == ["sfm"] * 10 + ["no features"] * 8
     few, unplaced = done.warnings
     assert "only 18 frames" in few and "10 of 18" in unplaced
-    (images.parent / "strict.work").symlink_to(images.parent / "out.work")  # the same work, judged again
+    (images.parent / "strict.work").symlink_to(images.parent / "out.work")  # the same work, checked again
     with pytest.raises(StageError, match="only 10 of 18") as caught:
         ingest(images, "strict", min_registered=0.9)
     assert "ingest.camera_model" in caught.value.hint

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.capture import sfm, sfm_worker
-from cleargs.capture.adjustment import lay_over
+from cleargs.capture.adjustment import align_to
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import CaptureConfig, SfmConfig
 from cleargs.capture.database import create_database
-from cleargs.capture.judging import fitting_shares, verified_matches, weakest_join
+from cleargs.capture.kept_out import fitting_shares, verified_matches, weakest_join
 from cleargs.capture.model import SparseModel
 from cleargs.capture.prepare import prepare
 from cleargs.capture.sfm_features import FIRST
@@ -63,7 +63,7 @@ def moved(placer: sfm_worker.Sfm, right: pycolmap.Reconstruction, poses: Poses) 
 
 def off(model: pycolmap.Reconstruction, right: pycolmap.Reconstruction) -> list[float]:
     """Return how far the cameras are from the right ones, as shares of the extent of these."""
-    lay_over(model, right, list(model.images.values()))
+    align_to(model, right, list(model.images.values()))
     centres = {number: image.projection_center() for number, image in right.images.items()}
     size = np.ptp(list(centres.values()), axis=0).max()
     return [

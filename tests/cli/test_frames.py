@@ -90,9 +90,9 @@ def test_figures_have_labels() -> None:
         "some_new_figure": 3,
     }
     assert list(labelled(summary)) == [
-        ("judges: frames", "1, 2"),
-        ("judges: PSNR in the first scene, dB", "22.5"),
-        ("judges: harm", "none"),
+        ("control frames: frames", "1, 2"),
+        ("control frames: PSNR in the first scene, dB", "22.5"),
+        ("control frames: harm", "none"),
         ("repairs by round", "11 in round 2"),
         ("round 1: chosen", "3 render, 9 restored, 2 as filmed"),
         ("weights", "5 from 0.1, 7 from 0.9"),

@@ -270,14 +270,14 @@ def test_a_report_in_one_file_has_all_images_and_the_scene_inside(page: Path, tm
 
 def test_the_report_shows_the_weight_with_which_a_frame_taught(run: FinishedRun) -> None:
     frame: Any = SimpleNamespace(frame_id=3, name="c.png", registered=True, split="train")
-    judged = {"weight": 0.12, "role": "reactivated", "r_sharpness": 0.06}
+    rated = {"weight": 0.12, "role": "reactivated", "r_sharpness": 0.06}
     found = {"model": "blur", "blur_px": 11.3, "weight_before": 0.12, "weight_after": 1.0}
-    row = FrameRow(frame, judged, formation=found)
-    assert (row.weight, row.teaching) == (1.0, "motion blur 11.3 px, simulated: counts fully")
-    assert FrameRow(frame, judged).teaching == "low sharpness 0.94: counts 12 %"
-    assert FrameRow(frame, judged | {"weight": 0.0}).teaching == "low sharpness 0.94: not used"
+    row = FrameRow(frame, rated, formation=found)
+    assert (row.weight, row.weight_text) == (1.0, "motion blur 11.3 px, simulated: counts fully")
+    assert FrameRow(frame, rated).weight_text == "low sharpness 0.94: counts 12 %"
+    assert FrameRow(frame, rated | {"weight": 0.0}).weight_text == "low sharpness 0.94: not used"
     held: Any = SimpleNamespace(registered=True, split="test")
-    assert FrameRow(held).teaching == "held out: not used"
+    assert FrameRow(held).weight_text == "held out: not used"
 
 
 def test_each_frame_has_the_psnr_of_its_last_steps(run: FinishedRun) -> None:

@@ -395,9 +395,9 @@ def test_harm_keeps_the_better_scene(capture: Capture, stage: str) -> None:
         result = consolidate.run(context)
     assert same_scene(context.out, better)
     assert (context.out / "rejected.ply").read_bytes() != (context.out / "scene.ply").read_bytes()
-    verdict = result.summary["held_back"]
-    assert "PSNR fell" in verdict["harm"]
-    assert verdict["psnr_after"] < verdict["psnr_before"] - 0.5
+    checked = result.summary["held_back"]
+    assert "PSNR fell" in checked["harm"]
+    assert checked["psnr_after"] < checked["psnr_before"] - 0.5
 
 
 def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from cleargs.formation.frame import FrameFormation
 from cleargs.rivr.need import frames_to_repair, rows_of_others
-from cleargs.rivr.targets import FrameAssessment, Supervision, select_holdout
+from cleargs.rivr.targets import FrameAssessment, Supervision, select_controls
 
 
 def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[FrameAssessment]:
@@ -70,14 +70,14 @@ def test_every_frame_that_is_not_tried_says_why_it_is_kept() -> None:
 @pytest.mark.parametrize(("strong", "expected"), [(1, 1), (7, 1), (8, 1), (16, 2), (23, 2), (24, 3)])
 def test_an_eighth_of_the_strong_frames_is_held_back(strong: int, expected: int) -> None:
     frames = appraised(["strong"] * strong + ["suppressed"] * 5)
-    held = select_holdout(frames)
+    held = select_controls(frames)
     assert len(set(held)) == expected
     assert all(frame_id < 10 + strong for frame_id in held)
     assert held == sorted(held)
 
 
 def test_held_back_frames_are_spread_over_the_strong_ones() -> None:
-    assert select_holdout(appraised(["strong"] * 16)) == [14, 22]
+    assert select_controls(appraised(["strong"] * 16)) == [14, 22]
 
 
 def test_the_sharpest_of_each_part_is_held_back() -> None:
@@ -86,10 +86,10 @@ def test_the_sharpest_of_each_part_is_held_back() -> None:
     frames[2] = replace(frames[2], R=0.9)
     frames[9] = replace(frames[9], R=0.6)
     frames[14] = replace(frames[14], B=0.1)
-    assert select_holdout(frames) == [12, 24]
+    assert select_controls(frames) == [12, 24]
 
 
 def test_the_stand_in_set_replaces_missing_strong_frames() -> None:
-    assert select_holdout(appraised(["suppressed"] * 5, stand_in={12})) == [12]
-    assert select_holdout(appraised(["strong", "suppressed"], stand_in={11})) == [10]
-    assert select_holdout(appraised(["suppressed"])) == []
+    assert select_controls(appraised(["suppressed"] * 5, stand_in={12})) == [12]
+    assert select_controls(appraised(["strong", "suppressed"], stand_in={11})) == [10]
+    assert select_controls(appraised(["suppressed"])) == []

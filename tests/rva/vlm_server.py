@@ -187,7 +187,7 @@ def make_ingest(folder: Path) -> None:
 
 
 class PreparedConfig(BaseModel):
-    """The settings of ingest that the report's verdict reads."""
+    """The settings of ingest that the report's outcome reads."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     fps: float | None = None

@@ -55,7 +55,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pictures = images(truth, 7)
     (root / "ingest" / "images").mkdir(parents=True)
     (root / "rva").mkdir()
-    rows, judged = [], []
+    rows, rated = [], []
     for frame_id, angle in enumerate(angles(7)):
         image = f"images/{frame_id:06d}.png"
         data = cv2.imencode(".png", pictures[frame_id][..., ::-1])[1].tobytes() if frame_id in ACTIVE else b""
@@ -82,7 +82,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
             | {"registered": registered, "n_points": 60, "split": "test" if frame_id == HELD_OUT else "train"}
         )
         if frame_id != HELD_OUT:
-            judged.append(
+            rated.append(
                 dict.fromkeys(RVA_FRAMES.names, 0.5)
                 | {"frame_id": frame_id, "name": image, "evaluator": "toy-1", "bin": 0}
                 | {"reliable": frame_id in ACTIVE, "stand_in": False, "reactivated_for": None}
@@ -90,7 +90,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 | {"role": "strong" if ACTIVE.get(frame_id, 0.0) > 0.8 else "suppressed"}
             )
     write_table(root / "ingest" / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
-    write_table(root / "rva" / "frames.parquet", pa.Table.from_pylist(judged, RVA_FRAMES), RVA_FRAMES)
+    write_table(root / "rva" / "frames.parquet", pa.Table.from_pylist(rated, RVA_FRAMES), RVA_FRAMES)
     xyz = truth.means.numpy().astype(np.float64)
     colour = np.rint(np.clip(truth.sh[:, 0].numpy() * SH_C0 + 0.5, 0, 1) * 255).astype(np.uint8)
     ids = np.arange(60)[::-1] * 10  # not sorted, with gaps

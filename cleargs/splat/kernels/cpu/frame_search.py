@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from cleargs.splat.kernels.cpu.frame_warp import aside, between, bow, ess
+from cleargs.splat.kernels.cpu.frame_warp import between, deviation, second_order, third_order
 from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.types import AnyArray, ArrayF32
 
@@ -83,8 +83,8 @@ def misfits(
                 at_x = place[0, n] + samples[k, 0] * along[0, n] + samples[k, 1] * wide[n]
                 at_y = place[1, n] + samples[k, 0] * along[1, n] + samples[k, 2] * wide[n]
                 if curve is not None:
-                    at_x += aside(samples[k, 0], bent[0, n], bent[2, n])
-                    at_y += aside(samples[k, 0], bent[1, n], bent[3, n])
+                    at_x += deviation(samples[k, 0], bent[0, n], bent[2, n])
+                    at_y += deviation(samples[k, 0], bent[1, n], bent[3, n])
                 i, a = between(at_x, right)
                 j, b = between(at_y, bottom)
                 exposed[n] += _mixed(image, i, j, a, b)
@@ -141,7 +141,7 @@ def normal_equations(
         # The image, and its derivatives times each polynomial of time.
         sums = np.zeros((5 if curve is None else 9, count), np.float32)
         for t in times:
-            second, third = bow(t), ess(t)
+            second, third = second_order(t), third_order(t)
             for p in range(count):
                 at_x = place[0, p] + t * along[0, p]
                 at_y = place[1, p] + t * along[1, p]

@@ -60,21 +60,21 @@ def between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, f
 
 
 @inlined
-def bow(t: Any) -> Any:
+def second_order(t: Any) -> Any:
     """Return the polynomial of second order at time ``t`` of the exposure, from -1/2 to 1/2."""
     return t * t - np.float32(1.0 / 12.0)
 
 
 @inlined
-def ess(t: Any) -> Any:
+def third_order(t: Any) -> Any:
     """Return the polynomial of third order at time ``t`` of the exposure."""
     return t * (t * t - np.float32(3.0 / 20.0))
 
 
 @inlined
-def aside(t: Any, bend: Any, cube: Any) -> Any:
+def deviation(t: Any, bend: Any, cube: Any) -> Any:
     """Return the displacement from the straight path at time ``t`` of the exposure, along one axis."""
-    return bow(t) * bend + ess(t) * cube
+    return second_order(t) * bend + third_order(t) * cube
 
 
 @inlined
@@ -118,7 +118,7 @@ def _place_at(path: Any, disc: Any, t: Any, curve: Any) -> Any:
     """Return the position in the sharp image of a sample at time ``t``, offset from the path by ``disc``."""
     place, sweep, bend, cube = path
     place = place + sweep * t + disc
-    return place if curve is None else place + bend * bow(t) + cube * ess(t)
+    return place if curve is None else place + bend * second_order(t) + cube * third_order(t)
 
 
 @inlined
@@ -126,7 +126,7 @@ def _along_axis(path: Any, disc: Any, t: Any, curve: Any) -> Any:
     """Return one coordinate of the position of `_place_at`, for a path along one axis."""
     place, sweep, bend, cube = path
     place = place + t * sweep + disc
-    return place if curve is None else place + aside(t, bend, cube)
+    return place if curve is None else place + deviation(t, bend, cube)
 
 
 @inlined

@@ -94,7 +94,7 @@ def displace(
 
 
 @triton.jit
-def look(pixel, inside, offset, sweep, radius, height, width, margin):
+def sampled_places(pixel, inside, offset, sweep, radius, height, width, margin):
     """Return the mean places that pixels sample, x and y, their sweeps, and the radii of their discs, px."""
     plane = height * width
     x = (pixel % width + margin).to(tl.float32) + tl.load(offset + pixel, mask=inside, other=0.0)
@@ -118,7 +118,7 @@ def curve_at(pixel, inside, curve, plane, CURVED: tl.constexpr):
 
 
 @triton.jit
-def aside(t, bend, cube):
+def deviation(t, bend, cube):
     """Return the displacement from the straight path at time ``t`` of the exposure, along one axis."""
     return (t * t - 1.0 / 12.0) * bend + t * (t * t - 3.0 / 20.0) * cube
 
@@ -179,7 +179,7 @@ def gather_light(
     inside = pixel < height * width
     channel = tl.arange(0, layout.CHANNELS)[None, :]
     rows, columns = height + 2 * margin, width + 2 * margin
-    x, y, along_x, along_y, wide = look(pixel, inside, offset, sweep, radius, height, width, margin)
+    x, y, along_x, along_y, wide = sampled_places(pixel, inside, offset, sweep, radius, height, width, margin)
     bend_x, bend_y, cube_x, cube_y = curve_at(pixel, inside, curve, height * width, CURVED)
     shape: tl.constexpr = [BLOCK, layout.CHANNELS]
     total = tl.zeros(shape, tl.float32)
@@ -187,7 +187,7 @@ def gather_light(
         t, u, v = tl.load(samples + 3 * k), tl.load(samples + 3 * k + 1), tl.load(samples + 3 * k + 2)
         at_x, at_y = x + t * along_x + u * wide, y + t * along_y + v * wide
         if CURVED:
-            at_x, at_y = at_x + aside(t, bend_x, cube_x), at_y + aside(t, bend_y, cube_y)
+            at_x, at_y = at_x + deviation(t, bend_x, cube_x), at_y + deviation(t, bend_y, cube_y)
         i, a = between(at_x, columns)
         j, b = between(at_y, rows)
         across, down = shares(a, TAPS), shares(b, TAPS)
@@ -223,7 +223,7 @@ def return_light(
     inside = pixel < height * width
     channel = tl.arange(0, layout.CHANNELS)[None, :]
     rows, columns = height + 2 * margin, width + 2 * margin
-    x, y, along_x, along_y, wide = look(pixel, inside, offset, sweep, radius, height, width, margin)
+    x, y, along_x, along_y, wide = sampled_places(pixel, inside, offset, sweep, radius, height, width, margin)
     bend_x, bend_y, cube_x, cube_y = curve_at(pixel, inside, curve, height * width, CURVED)
     coloured = inside[:, None] & (channel < 3)
     seen = tl.load(light + pixel[:, None] * layout.CHANNELS + channel, mask=coloured, other=0.0)
@@ -232,7 +232,7 @@ def return_light(
         t, u, v = tl.load(samples + 3 * k), tl.load(samples + 3 * k + 1), tl.load(samples + 3 * k + 2)
         at_x, at_y = x + t * along_x + u * wide, y + t * along_y + v * wide
         if CURVED:
-            at_x, at_y = at_x + aside(t, bend_x, cube_x), at_y + aside(t, bend_y, cube_y)
+            at_x, at_y = at_x + deviation(t, bend_x, cube_x), at_y + deviation(t, bend_y, cube_y)
         i, a = between(at_x, columns)
         j, b = between(at_y, rows)
         across, down = shares(a, TAPS), shares(b, TAPS)

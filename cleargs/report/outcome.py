@@ -1,4 +1,4 @@
-"""The verdict of a report: the quality of the result in words and one figure.
+"""The outcome of a report: the quality of the result in words and one figure.
 
 The thresholds are round numbers, chosen by judgement. They are not calibrated by people's ratings of scenes.
 Figures of training poses measure how well a scene matches the video, not the quality of new views.
@@ -27,7 +27,7 @@ HEADLINES: Mapping[Tone, str] = {
 }
 
 
-class Verdict(NamedTuple):
+class Outcome(NamedTuple):
     """The first lines of a report."""
 
     tone: Tone
@@ -45,7 +45,7 @@ def figure_of(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
     return value
 
 
-def verdict(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> Verdict:
+def outcome(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> Outcome:
     """Return the first lines of a report. ``unseen`` is the PSNR, dB, of each frame that was held out."""
     known = [figure_of(manifests, stage, "psnr_unseen") for stage in reversed(SCENES)]
     psnr = next((value for value in known if value is not None), None)
@@ -53,9 +53,9 @@ def verdict(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen:
     if psnr is None:
         trained = "g0" in manifests
         headline = "The scene is trained." if trained else "The capture is prepared. No scene is trained yet."
-        return Verdict("fair", headline, text, "")
+        return Outcome("fair", headline, text, "")
     tone: Tone = "good" if psnr >= CLOSE_DB else "fair" if psnr >= LOOSE_DB else "poor"
-    return Verdict(tone, HEADLINES[tone], text, f"{psnr:.1f}")
+    return Outcome(tone, HEADLINES[tone], text, f"{psnr:.1f}")
 
 
 def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> str:

@@ -1,6 +1,6 @@
 """Score the frames in a folder and restore the worst one.
 
-python judge_frames.py FOLDER OUT.png
+python rate_frames.py FOLDER OUT.png
 """
 
 import sys
