@@ -241,7 +241,7 @@ def test_an_unscored_frame_is_marked_and_tried_again_later(bench: Bench, tmp_pat
         assert {rows[k][name] for name in scores} == {None}
         assert (rows[k]["role"], rows[k]["weight"], rows[k]["reliable"]) == ("suppressed", 0.0, False)
     assert cues_of(rows[3]) == true_cues(3)
-    supervision = load_supervision(bench.root / "ingest", bench.root / "out", holdout_share=0.125)
+    supervision = load_supervision(bench.root / "ingest", bench.root / "out", share=0.125)
     assert sorted(supervision.views) == [0, 1, 3, 5], "--allow-partial continues without them"
     assert "frame 2" in bench.remarks.warnings[0] and "defocus lies outside" in bench.remarks.warnings[0]
     assert "frame 4" in bench.remarks.warnings[1] and "500" in bench.remarks.warnings[1]

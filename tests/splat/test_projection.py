@@ -149,7 +149,7 @@ def test_camera():
     half = camera.scaled(0.5)
     assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (50, 25, 40, 35, 25.5, 12)
     assert camera.scaled(1e-6).width == 1
-    with pytest.raises(InputError, match="focal"):
+    with pytest.raises(InputError, match=r"not usable: 10x10, fx fy cx cy = \(0\.0, 1\.0"):
         Camera(10, 10, 0.0, 1.0, 5.0, 5.0, np.eye(4))
     with pytest.raises(InputError, match="not usable"):
         Camera(10, 10, 1.0, 1.0, float("nan"), 5.0, np.eye(4))
