@@ -8,6 +8,7 @@ import re
 import shutil
 from base64 import b64decode
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal, cast
@@ -97,6 +98,14 @@ def test_every_file_that_the_page_names_is_there(page: Path, parsed: Page) -> No
     assert set(frames[5]["layers"]) == {"observed", "final"}  # no repair was tried
     assert set(frames[6]["layers"]) == {"observed"} and frames[6]["time"] is None  # it has no pose
     assert frames[0]["chosen"] == "restored" and frames[4]["chosen"] is None
+
+
+@pytest.mark.parametrize("script", ["report.js", "stage.js"])
+def test_the_scripts_read_only_what_the_page_knows_of_a_frame(page: Path, script: str) -> None:
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page.read_text(), re.S)[1])
+    source = files("cleargs.report").joinpath("static", script).read_text(encoding="utf-8")
+    read = set(re.findall(r"\bframe\.(\w+)", source))
+    assert read - {"id"} and read <= data["frames"][0].keys()
 
 
 def test_every_picture_says_what_it_shows(parsed: Page) -> None:

@@ -51,7 +51,7 @@ const describe = (frame) => {
     title: `Frame ${frame.id} · ${frame.name}`,
     role: [frame.role || "not rated", decibels(frame)].filter(Boolean).join(" · "),
     details: [
-      part("Weight in training", frame.teaching || "not rated", [...pairs("Frame scores", figures), ...cues(frame)]),
+      part("Weight in training", frame.weight_text || "not rated", [...pairs("Frame scores", figures), ...cues(frame)]),
       ...(frame.worst ? [part("Worst cue, from 0 (good) to 1 (bad)", frame.worst)] : []),
       part("Repair", frame.why ? `${frame.repair}: ${frame.why}` : frame.repair, pairs("Scores, higher is better", scores)),
       ...pairs("Camera effects", Object.entries(frame.found)),
@@ -154,7 +154,7 @@ const describe = (frame) => {
     scrub.value = frames.indexOf(frame);
     lanes.style.setProperty("--at", scrub.value);
     scrub.setAttribute("aria-valuetext", `frame ${frame.id}`);
-    const facts = [frame.role || "not rated", frame.teaching, decibels(frame)];
+    const facts = [frame.role || "not rated", frame.weight_text, decibels(frame)];
     if (frame.time === null) facts.push("its camera is not known");
     one("#readout").replaceChildren(make("b", `Frame ${frame.id}`), make("span", facts.filter(Boolean).join(" · ")));
     const filmed = one("#filmed");
