@@ -67,11 +67,11 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update={"max_frames": frames, "max_size": size})
 
 
-VERSION = 16
+VERSION = 17
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
-OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
+OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "motion.parquet", "images", "colmap")
 LEFTOVERS = ("images/*.png",)
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "pillow", "numpy", "scipy")
 
@@ -135,6 +135,7 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
 def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, rotate and reduce them, find poses or use the given ones, undistort and publish."""
     from cleargs.capture.choice import held_out, holdout_hash, select_sharp_frames
+    from cleargs.capture.measuring import measure_motion, write_motion
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
     from cleargs.capture.sfm import reconstruct
@@ -160,6 +161,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     capture = select_sharp_frames(capture, long_side, reporter)
     frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
+    scene, motion = measure_motion(capture, frames, scene, work, reporter)
     registered = {image.name for image in scene.model.images.values()}
     test = held_out(
         config.holdout,
@@ -171,6 +173,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         test = {index for index, frame in enumerate(frames) if frame.source.test}
     outcome = scene.outcome
     model = publish(frames, scene.model, outcome.placed, test, work, context.out, config.max_size, reporter)
+    write_motion(context.out / "motion.parquet", frames, motion)
     return StageResult(
         summary={
             "kind": capture.kind,
@@ -179,6 +182,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "pose_convention": outcome.convention if capture.posed else None,
             "kept_out_matches_off_px": {name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
             "cameras": scene.cameras(),
+            **motion.summary(),
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),

@@ -48,8 +48,17 @@ class Capture:
     """``pq`` or ``hlg`` for an HDR video, which is tone-mapped."""
     stretch: tuple[float | None, float | None] = (None, None)
     """Start and end of the part of each video that is used, s. None: the first frame, the last frame."""
+    available: tuple[SourceFrame, ...] = ()
+    """All images of a folder in order, before choosing; empty for a video."""
+    frame_rate: float | None = None
+    """Images per second of a folder, if the user says so (`CaptureConfig.frame_rate`)."""
     notes: tuple[str, ...] = ()
     """Remarks on how the input was read, which are shown as warnings."""
+
+    @property
+    def has_clock(self) -> bool:
+        """Return True if times between frames are known in seconds."""
+        return self.kind == "video" or self.frame_rate is not None
 
     @property
     def posed(self) -> bool:

@@ -31,6 +31,13 @@ class CaptureConfig(FrozenModel):
     end: float | None = Field(
         None, gt=0, description="take a video up to this time, s; unset: up to its last frame"
     )
+    frame_rate: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="frames per second of the video from which the images of a folder were taken, by their "
+        "numbers; unset: times are in frames, and no readout is given in ms",
+    )
     layout: str = Field(
         "auto",
         json_schema_extra={"key": False, "plugin": "layouts"},  # the files that are read are in the key

@@ -50,6 +50,18 @@ class Reconstruction:
     similarity: Similarity
     outcome: SfmOutcome
 
+    def with_model(self, model: SparseModel) -> tuple[Reconstruction, float]:
+        """Return the reconstruction with an adjusted ``model``, and the factor by which its lengths changed.
+
+        Found poses are normalised again. Others stay in their world.
+        """
+        if self.outcome.method != "sfm":
+            return replace(self, model=model), 1.0
+        again = normalise([image.pose for _, image in sorted(model.images.items())])
+        return replace(
+            self, model=model.moved(again), similarity=self.similarity.then(again)
+        ), 1 / again.scale
+
     def cameras(self) -> list[dict[str, Any]]:
         """Return lens, mean focal length (px) and number of frames of each camera."""
         frames = Counter(image.camera_id for image in self.model.images.values())

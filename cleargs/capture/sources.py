@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, Layout
@@ -49,7 +50,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
             f"{source} gives {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",
             hint="give more images, record longer, or raise ingest.fps",
         )
-    return capture
+    return replace(capture, frame_rate=config.frame_rate)
 
 
 def frame_size(capture: Capture) -> tuple[int, int] | None:

@@ -120,14 +120,17 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, Image
         raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
 
 
-def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
-    """Yield frames like `decode_frames`, but grey [H, W], and neither turned nor stretched.
+def decode_grey(path: Path, pts: Collection[int], *, upright: bool = False) -> Iterator[tuple[int, ImageU8]]:
+    """Yield frames like `decode_frames`, but grey [H, W], and turned and stretched only if ``upright``.
 
     It is several times as fast. Frames that cannot be decoded, for example at the start of a clip that was
     cut out of another, are left out.
     """
-    for number, frame, _ in _decoded(path, pts):
-        yield number, np.asarray(frame.to_ndarray(format="gray"), np.uint8)
+    for number, frame, aspect in _decoded(path, pts):
+        grey = np.asarray(frame.to_ndarray(format="gray"), np.uint8)
+        if upright:
+            grey = _turned(grey, frame, max(1, round(aspect * frame.width)))
+        yield number, grey
 
 
 def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame, float]]:
@@ -173,9 +176,16 @@ def _require_few(subject: str, width: int, height: int, what: str = "pixels") ->
 def _oriented(frame: VideoFrame, width: int) -> ImageU8:  # [H, W, 3]
     """Return a decoded frame as upright sRGB; ``width`` is its width in square pixels before rotation."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
+    return _turned(np.asarray(rgb, np.uint8), frame, width)
+
+
+def _turned(picture: ImageU8, frame: VideoFrame, width: int) -> ImageU8:  # [H, W] or [H, W, 3]
+    """Return the stored picture of ``frame`` with square pixels, ``width`` of them in a row, and upright."""
     if width != frame.width:
-        rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_CUBIC), np.uint8)
-    return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
+        picture = np.asarray(
+            cv2.resize(picture, (width, frame.height), interpolation=cv2.INTER_CUBIC), np.uint8
+        )
+    return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90) % 4))
 
 
 def _signal(frame: VideoFrame) -> ImageF32:  # [H, W, 3]

@@ -86,7 +86,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         frames.append(SourceFrame(name, path, camera=camera, pose=pose))
     taken = chosen(frames, source, config.max_frames)
     sparse = model if len(model.point_ids) or model.dropped else None
-    return Capture("colmap", taken, len(frames), sparse, notes=tuple(notes))
+    return Capture("colmap", taken, len(frames), sparse, available=tuple(frames), notes=tuple(notes))
 
 
 def _models(root: Path) -> dict[Path, int]:

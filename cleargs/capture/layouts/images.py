@@ -40,7 +40,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         )
     frames = [SourceFrame(path.name, path) for path in files]
     notes = left_out(folder)
-    return Capture("images", chosen(frames, source, config.max_frames), len(frames), notes=notes)
+    taken = chosen(frames, source, config.max_frames)
+    return Capture("images", taken, len(frames), available=tuple(frames), notes=notes)
 
 
 def _images_of(root: Path) -> Path:

@@ -75,7 +75,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     frames.sort(key=lambda frame: frame_key(frame.name))
     names = [name_below_images(frame.name) for frame in frames]
     taken = chosen(frames, source, config.max_frames, names)
-    return Capture("transforms", taken, len(frames), notes=tuple(notes))
+    return Capture("transforms", taken, len(frames), available=tuple(frames), notes=tuple(notes))
 
 
 def _split_files(source: Path) -> list[Path]:
