@@ -28,8 +28,8 @@ _ENCODERS: Mapping[Codec, tuple[str, Mapping[str, str]]] = {
 }
 """Encoder and its settings: constant quality, no visible loss."""
 _AS_IT_COMES = "threads=1:mbtree=0:rc-lookahead=0:bframes=0"
-"""Each frame is coded without look-ahead, as a phone does. With look-ahead at a fixed rate x264 gave
-different bytes from call to call, even with one thread."""
+"""Each frame is coded without look-ahead, as a phone does. With look-ahead x264 gave different bytes from
+call to call, even with one thread: at a fixed rate, and at constant quality with B-frames."""
 
 
 def require_even(width: int, height: int) -> None:
@@ -47,12 +47,13 @@ def write_video(
     bits_per_pixel: float | None = None,
     *,
     codec: Codec = "h264",
+    repeatable: bool = False,
 ) -> None:
     """Write ``frames`` (at least one, read one by one) as an MP4: 4:2:0, BT.709, limited range.
 
-    ``bits_per_pixel`` is the rate over each second; one thread encodes, so that equal frames give equal
-    bytes. None: constant quality, no visible loss. Raises InputError for an odd size or if this PyAV has no
-    such encoder, and StoreError if the disk is full or not writable.
+    ``bits_per_pixel`` is the rate over each second. None: constant quality, no visible loss. With a rate, or
+    with H.264 if ``repeatable``, one thread encodes, so that equal frames give equal bytes. Raises InputError
+    for an odd size or if this PyAV has no such encoder, and StoreError if the disk is full or not writable.
     """
     encoder, options = _ENCODERS[codec][0], dict(_ENCODERS[codec][1])
     os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints all its settings on stderr
@@ -69,10 +70,12 @@ def write_video(
     require_even(width, height)
     rate = Fraction(fps).limit_denominator(1001)
     with atomic_path(path) as temporary, av.open(temporary, "w") as container:
+        if repeatable or bits_per_pixel is not None:
+            options["x264-params"] = _AS_IT_COMES
         if bits_per_pixel is not None:
             del options["crf"]
             bits = str(round(bits_per_pixel * width * height * fps))
-            options |= {"b": bits, "maxrate": bits, "bufsize": bits, "x264-params": _AS_IT_COMES}
+            options |= {"b": bits, "maxrate": bits, "bufsize": bits}
         stream = container.add_stream(encoder, rate=rate, options=options)
         assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
