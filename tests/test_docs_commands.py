@@ -19,10 +19,12 @@ import pytest
 from benchmarks.commands import benchmarks
 from benchmarks.commands import invoke as invoke_benchmarks
 from cleargs.cli.main import cli, invoke
+from cleargs.media.encode import write_video
 from cleargs.media.image import read_rgb, write_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.progress import SilentReporter
+from cleargs.synth.path import FPS
 from cleargs.synth.synthetic_capture import make_capture
 
 ROOT = Path(__file__).parents[1]
@@ -218,10 +220,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a short video, and with the names that the pages use."""
     folder = tmp_path_factory.mktemp("docs")
     clip = folder / "clip"
-    make_capture(
-        clip, "sharp", frames=13, width=240, height=136, seed=3, reporter=SilentReporter(), video=True
-    )
-    (clip / "capture.mp4").rename(folder / "walk.mp4")
+    make_capture(clip, "sharp", frames=13, width=240, height=136, seed=3, reporter=SilentReporter())
+    frames = [read_rgb(path) for path in sorted((clip / "images").iterdir())]
+    write_video(folder / "walk.mp4", frames, FPS)
     return folder
 
 

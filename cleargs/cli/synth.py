@@ -52,13 +52,18 @@ Protocols, with mean lengths at a width of 640 px:
 )
 @click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of room and path.")
-@click.option("--video", is_flag=True, help="Also write OUT/capture.mp4.")
+@click.option(
+    "--video",
+    is_flag=True,
+    help="Also write OUT/capture.mp4: 30 frames per second, with every fifth in OUT/images.",
+)
 @json_option
 def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> None:
     """Make a synthetic handheld capture of a procedural room in the new folder OUT.
 
     OUT/images and OUT/transforms.json are the capture. OUT/truth holds the ground truth: sharp views with
-    exact poses and depth, views off the camera path, and the degradations of each frame.
+    exact poses and depth, views off the camera path, and the degradations of each frame. With --video,
+    OUT/truth/motion.parquet has pose and speed of the camera in each frame of the video.
     """
     from cleargs.synth.synthetic_capture import make_capture
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,12 @@ from cleargs.progress import Reporter, log_reporter
 from cleargs.random_streams import Stream
 from cleargs.synth import phone
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
+from cleargs.synth.native_video import MOTION, NATIVE_FPS, STRIDE, native_frames, true_motion
 from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, distorted, instant_shutter
 from cleargs.synth.path import FPS, SHOT_SECONDS, HandheldPath, SceneSetup, frame_times
-from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, Fault, noisy_poses, plan_faults
+from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, Fault, Protocol, noisy_poses, plan_faults
 from cleargs.synth.raycast import room_setup
-from cleargs.types import ArrayF64
+from cleargs.types import ArrayF64, ImageU8
 
 PATH_POSES = 17
 """Number of poses of the true path of an exposure in ``truth/frames.parquet``."""
@@ -97,13 +98,16 @@ def make_capture(
         seed: Seed of the room, the walk and the faults.
         reporter: Receives the progress (default: the logger ``cleargs``).
         setup: World, course and lens for this number and size of frames; None: the room of ``seed``.
-        video: Also write ``out/capture.mp4``, which the protocol phone always has.
+        video: Write ``out/capture.mp4`` with 30 frames per second, of which the capture has every fifth, and
+            ``out/truth/motion.parquet`` (`cleargs.synth.native_video.MOTION`). Without it, only the protocols
+            of a phone write a video, with the frames of the capture.
 
     Returns:
         The contents of ``truth/capture.json``.
 
     Raises:
-        InputError: if the protocol is unknown, the folder is not empty, or a video cannot have this size.
+        InputError: if the protocol is unknown or has no video, the folder is not empty, or a video cannot
+            have this size.
 
     Example:
         cg.make_capture("small", "gs2e-medium", frames=4, width=96, height=64)
@@ -114,6 +118,11 @@ def make_capture(
         raise InputError(f"no protocol is called {protocol!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")
+    if video and rules.shots:
+        raise InputError(
+            f"the protocol {protocol} has no video: it takes one photograph per second",
+            hint="leave the video out, or choose another protocol, such as gs2e-medium",
+        )
     if video or rules.phone:
         require_even(width, height)
     rate = 1 / SHOT_SECONDS if rules.shots else FPS
@@ -134,7 +143,7 @@ def make_capture(
     novel = np.stack([setup.course.novel((number + 0.5) / count, rng) for number in range(count)])
     stems, novel_stems = ([f"{number:06d}" for number in range(views)] for views in (frames, count))
     (out / "images").mkdir(parents=True, exist_ok=True)
-    with reporter.task(f"synth {protocol}", 2 * frames + count) as task:
+    with reporter.task(f"synth {protocol}", (1 + STRIDE if video else 2) * frames + count) as task:
         motions, depths, nearnesses, luminances = [], [], [], []
         for folder in ("observed/images", "observed/depth", "novel/images", "novel/depth"):
             (out / "truth" / folder).mkdir(parents=True)
@@ -153,25 +162,39 @@ def make_capture(
             (out / "truth" / "moving").mkdir()
         for number, (motion, fault, nearness) in enumerate(zip(motions, faults, nearnesses, strict=True)):
             rng = np.random.default_rng([seed, Stream.EXPOSURES, number])
-            light, seen = _expose(setup, motion, fault, nearness, rng)
-            if any(rules.distortion):
-                light = distorted(light, setup.lens, rules.distortion)
-            shots.append(phone.develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
+            shot, seen = _shoot(setup, rules, look, motion, fault, nearness, rng)
+            shots.append(shot)
             moving = {"moving_share": float((seen > 0).mean())}
             rows.append(_row(number, images[number], motion, fault, rate) | processing | moving)
             if setup.film is not None:
                 mask = np.repeat(np.where(seen > 0, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
                 write_rgb(out / "truth" / "moving" / f"{stems[number]}.png", mask)
             task.advance()
+        filmed = shots
         if rules.phone:
-            shots = phone.encode_and_decode(out / "capture.mp4", shots, rate)
+            shots = phone.encode_and_decode(out / "capture.mp4", filmed, rate)
         for image, shot in zip(images, shots, strict=True):
             write_rgb(out / image, shot, quality=rules.jpeg)
         for stem, pose in zip(novel_stems, novel, strict=True):
             _write_sharp(out / "truth" / "novel", stem, setup, pose, look)
             task.advance()
-    if video and not rules.phone:
-        write_video(out / "capture.mp4", shots, rate)
+        if video:
+            native = native_frames(motions, faults)
+
+            def all_shots() -> Iterator[ImageU8]:
+                for number, (motion, fault) in enumerate(native):
+                    chosen, place = divmod(number, STRIDE)
+                    if place == STRIDE // 2:
+                        yield filmed[chosen]
+                        continue
+                    # Not 0 at the end: NumPy reads such a seed like the shorter one of a chosen frame.
+                    rng = np.random.default_rng([seed, Stream.EXPOSURES, chosen, place + 1])
+                    yield _shoot(setup, rules, look, motion, fault, nearnesses[chosen], rng)[0]
+                    task.advance()
+
+            bits = processing["codec_bits_per_pixel"] or None
+            write_video(out / "capture.mp4", all_shots(), NATIVE_FPS, bits, repeatable=True)
+            write_table(out / "truth" / "motion.parquet", true_motion(native, images), MOTION)
     write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), FRAMES)
     for kind, names, exact in (("observed", stems, poses), ("novel", novel_stems, novel)):
         _write_transforms(out / "truth" / kind, setup.lens, [f"images/{name}.png" for name in names], exact)
@@ -185,7 +208,7 @@ def make_capture(
         "width": width,
         "height": height,
         "fps": rate,
-        "video_fps": rate if video or rules.phone else None,
+        "video_fps": NATIVE_FPS if video else rate if rules.phone else None,
         "jpeg_quality": rules.jpeg,
         "codec_bits_per_pixel": processing["codec_bits_per_pixel"],
         "moving": setup.film is not None,
@@ -204,18 +227,16 @@ def make_capture(
     return summary
 
 
-def _expose(
+def _shoot(
     setup: SceneSetup,
+    rules: Protocol,
+    look: phone.Look,
     motion: SimulatedMotion,
     fault: Fault,
     nearness: float,  # mean of 1 / depth over the pixels that see a surface
-    rng: np.random.Generator,  # for the order of the points on the lens
-) -> tuple[ArrayF64, ArrayF64]:
-    """Render one frame with its motion and defocus.
-
-    Returns:
-        Linear light [H, W, 3], and per pixel [H, W] the share of the exposure that sees movement.
-    """
+    rng: np.random.Generator,  # for the order of the points on the lens, and the noise
+) -> tuple[ImageU8, ArrayF64]:
+    """Return a frame before its codec, and per pixel [H, W] the share of the exposure that sees movement."""
     shutter, aperture = motion.shutter(fault.exposure, fault.readout), PINHOLE
     if fault.defocus > 0:
         # `defocus` is the mean radius over the points of a uniform disc, which is 2/3 of the disc's radius.
@@ -225,10 +246,14 @@ def _expose(
         repeats = math.ceil(math.ceil(4 * fault.defocus**2) / shutter.samples)
         shutter = replace(shutter, index=np.tile(shutter.index, (repeats, 1)))
         aperture = Aperture(disc(shutter.samples, radius)[rng.permutation(shutter.samples)], focus)
-    if setup.film is not None:
-        return setup.film(shutter, setup.lens, aperture)
-    light = setup.world.render(shutter, setup.lens, aperture)
-    return light, np.zeros(light.shape[:2])
+    seen = np.zeros((setup.lens.height, setup.lens.width))
+    if setup.film is None:
+        light = setup.world.render(shutter, setup.lens, aperture)
+    else:
+        light, seen = setup.film(shutter, setup.lens, aperture)
+    if any(rules.distortion):
+        light = distorted(light, setup.lens, rules.distortion)
+    return phone.develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look), seen
 
 
 def _write_sharp(
