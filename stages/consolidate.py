@@ -36,11 +36,11 @@ class ConsolidateConfig(FrozenModel):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 45
+VERSION = 46
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
-    "ingest": ("frames.parquet", "images", "masks"),
+    "ingest": ("frames.parquet", "motion.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
     "g0": TRAINED,
     "rivr": (*TRAINED, "selection.parquet", *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1))),
@@ -77,6 +77,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
 
 def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Train RIVR's scene on raw frames and the latest accepted repairs, and check the result for harm."""
+    from cleargs.formation.measured import load_paths
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr import tables
@@ -97,8 +98,9 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     unrepaired = kept.intersection(row.frame_id for row in rows if row.exr is not None)
     tables.write_repairs(context.out / "repairs.parquet", repairs)
 
-    g0 = TrainedScene(context.inputs["g0"], context.device)
-    start = TrainedScene(rivr, context.device) if repairs or kept else g0
+    measured = load_paths(context.inputs["ingest"])
+    g0 = TrainedScene(context.inputs["g0"], context.device, measured)
+    start = TrainedScene(rivr, context.device, measured) if repairs or kept else g0
     consolidated, trainings = start, []
     if repairs or kept:
         pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]

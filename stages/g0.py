@@ -51,11 +51,18 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 42
+VERSION = 43
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
-    "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
+    "ingest": (
+        "frames.parquet",
+        "points.parquet",
+        "observations.parquet",
+        "motion.parquet",
+        "images",
+        "masks",
+    ),
     "rva": ("frames.parquet",),
 }
 OUTPUTS = (*TRAINED, "train.parquet")
@@ -91,6 +98,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, frame_gains, gain_spread, write_exposure
     from cleargs.formation.frames import real_views, seen_points
+    from cleargs.formation.measured import load_paths
     from cleargs.formation.movement import TOLERANCE, write_movement
     from cleargs.formation.observed import MAX_EVALUATED, evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
@@ -136,6 +144,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
         lr_exposure=config.lr_exposure,
         tolerance=TOLERANCE if movement_expected(config, allocation) else 0.0,
         draft=config.quality == "draft",
+        measured=load_paths(ingest),
     )
     trainer = Trainer(
         Scene(gaussians, config.antialias, config.background or BLACK),

@@ -115,11 +115,11 @@ class RivrConfig(FrozenModel):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 48
+VERSION = 49
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
-    "ingest": ("frames.parquet", "images", "masks"),
+    "ingest": ("frames.parquet", "motion.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
     "g0": TRAINED,
 }
@@ -177,6 +177,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 
 def run(context: StageContext[RivrConfig]) -> StageResult:
     """Make, score, choose and distil candidates, group by group and round by round; check for harm."""
+    from cleargs.formation.measured import load_paths
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
@@ -190,7 +191,8 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
-    g0 = TrainedScene(context.inputs["g0"], context.device)
+    measured = load_paths(context.inputs["ingest"])
+    g0 = TrainedScene(context.inputs["g0"], context.device, measured)
     if context.settings["g0"].quality == "draft":
         return _unchanged(context, supervision, g0)
     chosen = frames_to_repair(config.targets, supervision, g0.formations)

@@ -212,6 +212,7 @@ class MotionRow:
     status: Annotated[str, "measured, or the reason why there is no motion"]
     tracks: Annotated[int | None, "tracks into the neighbour with the fewest"]
     error_px: Annotated[float | None, "median distance of the tracks from the path, px of the working image"]
+    median_depth: Annotated[float | None, "median depth of the tracked points, world units"]
     speed_px: Annotated[float | None, f"mean speed of the tracked points, px of the working image {_PER_S}"]
     doubt: Annotated[float | None, "share of the speed that the farther neighbours change"]
     path: Annotated[
@@ -241,6 +242,7 @@ def write_motion(path: Path, frames: Sequence[WorkFrame], motion: CameraMotion) 
                 "status": motion.status[frame.image],
                 "tracks": measured and measured.tracks,
                 "error_px": measured and measured.error_px,
+                "median_depth": measured and measured.median_depth,
                 "speed_px": measured and measured.speed_px,
                 "doubt": measured and measured.doubt,
                 "path": measured and measured.path.ravel().tolist(),

@@ -63,6 +63,8 @@ class MeasuredMotion:
     """Number of tracks into the neighbour with the fewest."""
     error_px: float
     """Median distance of the tracks from the path, px."""
+    median_depth: float
+    """Median depth of the tracked points, world units."""
     speed_px: float
     """Mean speed of the tracked points in the image, px per s."""
     frame_s: float
@@ -139,6 +141,7 @@ def measure(tracks: Tracks, readout: float = 0.0) -> MeasuredMotion | None:
         covariance + np.outer(change, change),
         int(counted[used].min()),
         float(np.median(off)),
+        float(np.median(tracks.points[:, 2])),
         speed,
         float(np.abs(tracks.times[near]).min()),
         in_image(change) / max(speed, 1e-12),
@@ -213,4 +216,9 @@ def projected(points: ArrayF64, twists: ArrayF64) -> tuple[ArrayF64, ArrayF64]:
 def in_other_units(motion: MeasuredMotion, factor: float) -> MeasuredMotion:
     """Return the motion in a world whose lengths are ``factor`` times as large."""
     units = np.array([factor] * 3 + [1.0] * 3)
-    return replace(motion, path=motion.path * units, covariance=motion.covariance * np.outer(units, units))
+    return replace(
+        motion,
+        path=motion.path * units,
+        covariance=motion.covariance * np.outer(units, units),
+        median_depth=motion.median_depth * factor,
+    )

@@ -34,12 +34,15 @@ from cleargs.types import ArrayF64
 
 ROUNDS = 2
 """Number of estimates of a readout. Each one measures the speeds with the readout of the one before."""
-GOOD_ERROR = 2.0
-"""Largest error of the tracks of a frame that counts for the readout, as a factor of that of a good frame. In
-shaky and blurred frames measured speeds are too uncertain, which makes readouts too small."""
+GOOD = 0.25
+"""Quantile of the frames' tracking errors that is the error of a good frame. A frame counts 1 / (1 + e^2) for
+the readout, with e its error over that of a good frame: in shaky frames speeds are uncertain, and uncertain
+speeds make readouts too small."""
+MIN_ERROR_PX = 0.02
+"""Smallest error of a good frame, px."""
 MIN_FRAMES = 8
-"""Minimum number of such frames of a lens."""
-MAX_OBSERVATIONS = 60_000
+"""Minimum number of measured frames of a lens."""
+MAX_OBSERVATIONS = 40_000
 """Maximum number of observations for an estimate. Points are left out evenly."""
 
 
@@ -109,6 +112,7 @@ class _Capture:
             np.array([cameras.index(image.camera_id) for image in images]),
             np.array([sum(camera.focal) / 2 for camera in lens_cameras]),
             np.zeros((len(images), ORDER, TWIST)),
+            np.ones(len(images)),
         )
         self._rows = np.zeros(len(images)), np.zeros(len(images), bool)
         self.motions: dict[str, MeasuredMotion] = {}
@@ -173,11 +177,16 @@ class _Capture:
             readout = 0.0 if found is None else found.seconds
             motions = {n: self._motion(n, readout, columns) for n in members}
             errors = [motion.error_px for motion in motions.values() if motion is not None]
-            limit = GOOD_ERROR * float(np.quantile(errors, 0.25)) if errors else 0.0
-            good = {n: m for n, m in motions.items() if m is not None and m.error_px <= limit}
-            if len(good) < MIN_FRAMES:
+            known = {n: motion for n, motion in motions.items() if motion is not None}
+            if len(known) < MIN_FRAMES:
                 return None
-            seen = self._with_paths(good, columns).select(np.isin(self._seen.frame, list(good)))
+            good = max(float(np.quantile(errors, GOOD)), MIN_ERROR_PX)
+            trust = np.zeros(len(self._frames))
+            for n, motion in known.items():
+                trust[n] = 1.0 / (1.0 + (motion.error_px / good) ** 2)
+            seen = replace(self._with_paths(known, columns), trust=trust).select(
+                trust[self._seen.frame] > 0.0
+            )
             every = max(1, len(seen.point) // MAX_OBSERVATIONS)
             # Kept-out points are every tenth one, so points are left out by another rule.
             seen = seen.select(seen.point // 16 % every == 0)
@@ -282,8 +291,8 @@ def _write_motions(path: Path, motions: Mapping[str, MeasuredMotion]) -> None:
     arrays: dict[str, ArrayF64] = {}
     for image, motion in motions.items():
         arrays[f"{image}.path"], arrays[f"{image}.covariance"] = motion.path, motion.covariance
-        numbers = [motion.tracks, motion.error_px, motion.speed_px, motion.frame_s, motion.doubt]
-        arrays[f"{image}.numbers"] = np.array(numbers, np.float64)
+        names = ("tracks", "error_px", "median_depth", "speed_px", "frame_s", "doubt")
+        arrays[f"{image}.numbers"] = np.array([getattr(motion, name) for name in names], np.float64)
     with atomic_path(path) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
 

@@ -49,6 +49,7 @@ class Observations:
     camera: NDArray[np.int64]  # [N] number of the camera of each frame
     focal: ArrayF64  # [C] px per unit of the tangents
     paths: ArrayF64  # [N, ORDER, 6] of `MeasuredMotion`; 0 where none is known
+    trust: ArrayF64  # [N] weight of the keypoints of each frame, 0 to 1
 
     def select(self, which: MaskBool) -> Observations:  # [M]
         """Return these observations alone."""
@@ -160,6 +161,7 @@ class _Step:
         place, slopes, twists = geometry.places(seen)
         misses = geometry.misses(seen)
         weight = 1.0 / np.sqrt(1.0 + np.einsum("mc,mc->m", misses, misses) / OUTLIER_PX**2)
+        weight *= np.sqrt(seen.trust[seen.frame])
         self._misses = (weight[:, None] * misses).ravel()
         columns, values = [np.zeros((len(place), 0), np.int64)], [np.zeros((len(place), 2, 0))]
         if poses:

@@ -18,6 +18,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,10 +26,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
-from cleargs.formation.frame import FrameFormation, fit_motion, packed, unpacked
+from cleargs.formation.frame import FrameFormation, Shot, Terms, fit_motion, packed, unpacked
+from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import Movement
 from cleargs.formation.observed import FormedView
-from cleargs.formation.shutter import ROLLING, CameraSpeeds, frames_to_test, rolls, with_skew
+from cleargs.formation.shutter import (
+    MIN_TIMED_FRAMES,
+    ROLLING,
+    CameraSpeeds,
+    frames_to_test,
+    rolls,
+    with_skew,
+)
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.types import Render, group
@@ -47,6 +56,8 @@ search. It doubles from one try to the next, because the scene changes less and 
 SETTLED = 7
 """Looks at a frame after which later trainings keep its formation. Scenes lost nothing after 7 and 15 looks,
 and up to 0.2 dB after 3 (docs/experiments/formation.md)."""
+MEASURED_SHARE = 0.5
+"""Least share of the frames with a measured motion, at which ingest decides if the shutter rolls."""
 SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
 """A capture is sharp if at most this share of the frames that had a look need a model, and at least this many
 had one. In a sharp capture a frame is searched at its first look only if the test finds blur."""
@@ -77,14 +88,20 @@ class CaptureFormation:
         moving: Mapping[int, MaskBool] | None = None,  # cells that move, from an earlier training
         tolerance: float = 0.0,  # difference of mean sRGB colours above which a cell can move; 0: no looks
         draft: bool = False,  # search a frame only if the test finds blur, also at the first look
+        measured: Mapping[int, MeasuredPath] | None = None,  # motions of ingest, by frame_id
     ) -> None:
         weighted = [view for view in views if view.weight > 0.0]
         self._config, self._draft = config, draft
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
         filmed = sorted((v for v in weighted if v.kind == "real"), key=lambda view: view.frame_id)
         real = [view.frame_id for view in filmed]
-        known = known or {}
-        self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
+        known, self._measured = known or {}, measured or {}
+        self._frames = {
+            view.frame_id: known.get(view.frame_id) or _unseen(view, self._measured.get(view.frame_id))
+            for view in filmed
+        }
+        judged = sum(frame_id in self._measured for frame_id in real)
+        self._shutter_measured = judged >= max(MIN_TIMED_FRAMES, MEASURED_SHARE * len(real))
         if self._rolls():  # a training begins with a search of each frame
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         enough = (SETTLED - 1) * config.every
@@ -143,46 +160,15 @@ class CaptureFormation:
         affines = self._affines
         affine = None if affines is None else affines.affine(frame_id)
         own, mask = mask, self._movement.still(frame_id, mask, target)
-
-        def explained() -> FrameFormation:
-            """Return the frame's formation, estimated with the current scene."""
+        weight, motion = view.weight, None
+        if self._config.enabled and view.kind == "real":
+            shot = Shot(camera, affine, target, mask, render, factor)
+            if self._estimated(frame_id, progress, shot):
+                frame = self._frames[frame_id]
+                self._frames[frame_id] = replace(frame, draws=frame.draws + 1)
+                weight = self.weight(frame_id)
             frame = self._frames[frame_id]
-            return fit_motion(
-                frame,
-                self._config,
-                camera,
-                affine,
-                target,
-                mask,
-                render,
-                factor=factor,
-                pose=frame_id in self._posed,
-                doubted=self._weights[frame_id] < DOUBTED,
-                rolling=self._rolls(),
-                again=_searched_again(frame.draws // self._config.every),
-                test_rolling=self._asks(frame_id),
-                sparing=self._draft or self._sharp(),
-            )
-
-        begun = progress >= self._config.start
-        searched = self._config.enabled and view.kind == "real"
-        if searched and not begun:
-            if progress >= ROLLING_START and self._asks(frame_id) and not self._rolls():
-                gain = explained().skew_gain
-                self._frames[frame_id] = replace(self._frames[frame_id], skew_gain=gain)
-            searched = self._rolls()
-        if searched and self._due(frame_id):
-            self._frames[frame_id] = explained()
-            if self._all_looked_at(frame_id):
-                self._add_missing_skew()
-        weight = view.weight
-        motion = None
-        if searched:
-            frame = self._frames[frame_id]
-            self._frames[frame_id] = replace(frame, draws=frame.draws + 1)
-            weight = self.weight(frame_id)
-            if frame.model != "none":
-                motion = frame
+            motion = None if frame.model == "none" else frame
 
         def look(image: Tensor, rendered: Render, margin: int) -> Tensor | None:
             """Find what moves in the frame, and return the pixels that count."""
@@ -206,6 +192,34 @@ class CaptureFormation:
             mask=mask,
             look=look if looks else None,
         )
+
+    def _estimated(self, frame_id: int, progress: float, shot: Shot) -> bool:
+        """Estimate the formation of a frame if it is due. Return False before the estimates begin."""
+        if progress < self._config.start and not self._rolls():
+            if progress >= ROLLING_START and self._asks(frame_id):
+                gain = self._look(frame_id, shot).skew_gain
+                self._frames[frame_id] = replace(self._frames[frame_id], skew_gain=gain)
+            if not self._rolls():
+                return False
+        if self._due(frame_id):
+            self._frames[frame_id] = self._look(frame_id, shot)
+            if self._all_looked_at(frame_id):
+                self._add_missing_skew()
+        return True
+
+    def _look(self, frame_id: int, shot: Shot) -> FrameFormation:
+        """Return the formation of a frame, estimated with the current scene."""
+        frame = self._frames[frame_id]
+        tested: Literal["tested", "still"] = "tested" if self._asks(frame_id) else "still"
+        terms = Terms(
+            pose=frame_id in self._posed,
+            doubted=self._weights[frame_id] < DOUBTED,
+            shutter="rolls" if self._rolls() else tested,
+            curve=_searched_again(frame.draws // self._config.every),
+            sparing=self._draft or self._sharp(),
+            measured=self._measured.get(frame_id),
+        )
+        return fit_motion(frame, self._config, shot, terms)
 
     def digest(self) -> str:
         """Return a digest of the settings and of the formations at the start."""
@@ -240,14 +254,17 @@ class CaptureFormation:
         return None
 
     def _rolls(self) -> bool:
-        return rolls(self._frames.values())
+        """Return True if frames without a measured motion may have a skew."""
+        return not self._shutter_measured and rolls(self._frames.values())
 
     def _asks(self, frame_id: int) -> bool:
         """Return True if a frame must still be tested for a rolling shutter.
 
         Once more than half of the frames to test show no skew, the others cannot change the median.
         """
-        if frame_id not in self._tested or self._frames[frame_id].skew_gain is not None:
+        if self._shutter_measured or frame_id not in self._tested:
+            return False
+        if self._frames[frame_id].skew_gain is not None:
             return False
         gains = [self._frames[k].skew_gain for k in self._tested]
         return 2 * sum(gain is not None and gain <= ROLLING for gain in gains) <= len(gains)
@@ -275,6 +292,15 @@ class CaptureFormation:
         models = [frame.model for frame in self._frames.values() if frame.draws > 0]
         modelled = len(models) - models.count("none")
         return len(models) >= MIN_SEARCHED_FRAMES and modelled <= SHARP_SHARE * len(models)
+
+
+def _unseen(view: TrainingView, measured: MeasuredPath | None) -> FrameFormation:
+    """Return the formation of a frame before the first look: its measured skew."""
+    if measured is None or not measured.rolls:
+        return FrameFormation(view.frame_id)
+    motion = measured.read(view.camera)
+    reach = 0.5 * float(np.abs(motion.skew).sum())
+    return FrameFormation(view.frame_id, motion, "skew", reach_px=reach)
 
 
 def _searched_again(looks: int) -> bool:

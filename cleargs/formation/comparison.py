@@ -128,8 +128,12 @@ class Level:
         self._total = max(float(self._holdout.sum(dtype=np.float64)), 1.0)
         self._pair, self._reduced = pair, reduced
         self.scale = size[0] / width
-        rows = (np.arange(size[1]) + 0.5) * height / size[1] - margin
-        self._down = (rows / pair.camera.height - 0.5).astype(np.float32)
+        self._across, self._down = (
+            (((np.arange(reduced_side) + 0.5) * side / reduced_side - margin) / own - 0.5).astype(np.float32)
+            for reduced_side, side, own in zip(
+                size, (width, height), (pair.camera.width, pair.camera.height), strict=True
+            )
+        )
 
     # Only a fit needs the next properties. The misfit without any motion is computed without them.
 
@@ -195,7 +199,8 @@ class Level:
 
         offset = flow(motion.pose)
         if motion.skew.any():
-            offset = offset + flow(motion.skew) * self._down[:, None]
+            read = self._across if motion.columns else self._down[:, None]
+            offset = offset + flow(motion.skew) * read
         radius = self._nowhere[0]
         if motion.disc_px > 0.0:
             disc = np.float32(motion.disc_px * self.scale)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from enum import Enum
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -24,9 +25,10 @@ from cleargs.formation.comparison import (
     finest_level,
     luminance,
 )
+from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.motion import MODELS, TWISTS, FrameMotion, Model, widened
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
-from cleargs.formation.search import blur_along, preferred, refine, search
+from cleargs.formation.search import blur_along, corrected, measured_fits, named, preferred, refine, search
 from cleargs.formation.warp import Warp, displacement_fields, path_lengths
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
@@ -52,7 +54,10 @@ MARGIN_STEP = 4
 MARGIN_SHARE = 0.25
 """Largest margin, as a share of the shorter side."""
 
-LENS = ("disc_px", "focus", "median_depth")
+EXPOSURES = np.geomspace(1 / 16, 3.0, 18)
+"""Exposure times that are tried with a measured motion, in frames of the video."""
+
+LENS = ("disc_px", "focus", "median_depth", "exposure_s")
 MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
 """Fields of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
@@ -85,6 +90,11 @@ class FrameFormation:
     """Training steps on the frame since the first estimate of its formation."""
 
     @property
+    def searched(self) -> bool:
+        """True if a search found the blur or the defocus of the frame."""
+        return self.model in ("blur", "both", "defocus") and self.motion.exposure_s == 0.0
+
+    @property
     def explained(self) -> float:
         """Share of the misfit that the model removes."""
         return explained_share(self.misfit, self.misfit_still)
@@ -97,74 +107,206 @@ def described(frame: FrameFormation) -> str:
     return ", ".join(f"{part} {lengths[part]:.1f} px" for part in parts if part in lengths) or "nothing"
 
 
+@dataclass(frozen=True)
+class Shot:
+    """A raw frame at the size of a training step, and the scene that it shows."""
+
+    camera: Camera
+    """The camera of the frame, reduced by ``factor``."""
+    affine: Tensor | None  # [3, 4] colour of the frame
+    target: Tensor  # [H, W, 3] sRGB
+    mask: Tensor | None  # [H, W]
+    render: Renderer
+    """Renders the scene with depth."""
+    factor: float = 1.0
+    """Size of ``camera`` over that of the frame."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Facts about a frame and its capture on which a look depends."""
+
+    pose: bool = False
+    """Correct the pose together with a motion."""
+    doubted: bool = False
+    """RVA doubts the frame, so less evidence is needed for a search."""
+    shutter: Literal["still", "tested", "rolls"] = "still"
+    """still: no model with a skew; tested: none, but `FrameFormation.skew_gain` is measured; rolls: all."""
+    curve: bool = False
+    """Try a higher order of the path, and search a frame with a curved path or a rolling shutter."""
+    sparing: bool = False
+    """Also the first time, search only for a blur that the test and `_Look._resembles` admit."""
+    measured: MeasuredPath | None = None
+    """Motion that ingest measured. Its skew replaces all others, and its blur the first search."""
+
+
+class Reason(Enum):
+    """Reason for a search."""
+
+    FIRST = "a scene that is still soft hides short blurs from the test"
+    SHUTTER = "a skew must be found or tested, which the test cannot see"
+    MODEL = "the model of the frame is no longer admitted"
+    CURVE = "a descent with many unknowns that began in a soft scene can stay in a wrong path"
+    BLUR = "the test finds blur that the model does not explain"
+
+
 def fit_motion(
     frame: FrameFormation,  # the formation so far, whose model remains a candidate
     config: FormationConfig,
-    camera: Camera,  # the frame's, reduced by ``factor``
-    affine: Tensor | None,  # [3, 4] colour of the frame
-    target: Tensor,  # [H, W, 3] sRGB, the frame
-    mask: Tensor | None,  # [H, W]
-    render: Renderer,  # renders the scene with depth
-    *,
-    factor: float = 1.0,  # size of ``camera`` over that of the frame
-    pose: bool = False,  # correct the pose together with a motion
-    doubted: bool = False,  # RVA doubts the frame, so less evidence is needed for a search
-    rolling: bool = False,  # admit models with a skew
-    test_rolling: bool = False,  # measure `skew_gain` even where no such model is admitted
-    again: bool = False,  # try a higher order, and search a frame with a curved path or a rolling shutter
-    sparing: bool = False,  # also the first time, search only for a blur that the test and `_resembled` admit
+    shot: Shot,
+    terms: Terms,
 ) -> FrameFormation:
-    """Estimate how a raw frame was taken, from the scene that ``render`` shows.
+    """Estimate how a raw frame was taken, from the scene that it shows.
 
-    The known formation is refined. The first time, the frame is also searched. Later it is searched only if
-    the test of `pretest` finds blur that the model does not explain and that the last search did not leave,
-    or if a rolling shutter must be tested, since that test cannot detect a skew.
+    The known formation is refined, or the measured motion is followed. The frame is searched only for a
+    `Reason`.
     """
-    # A formation that was found under the other assumption about the shutter is searched again.
-    unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
-    untested = rolling and _admitted(frame.model, rolling=False) and unmeasured
-    margin = margin_for(frame.reach_px * factor, camera)
-    rendered = render(widened(camera, margin))
-    pair = frame_pair(rendered, affine, target, mask, camera, margin)
-    known = _scaled(frame.motion, factor)
-    found = refine(pair, frame.model, known, pose=pose, curve=again)
-    followed = preferred(found[1:] or found)
-    best = _accepted(followed, found[0], frame.model, config)
-    evidence = _unexplained(pair, rendered, best)
-    skews = rolling or test_rolling
-    first = frame.draws == 0 and not sparing  # a scene that is still soft hides short blurs from the test
-    # A descent with many unknowns that began in a soft scene can end in a wrong path and stay there.
-    again = again and (rolling or followed.motion.order > 1)
-    asked = first or untested or test_rolling or again or not _admitted(frame.model, rolling)
-    enough = max(DOUBTED_EVIDENCE if doubted else EVIDENCE, GROWN_EVIDENCE * frame.evidence)
-    left = min(frame.evidence, evidence.gain)
-    blurred = evidence.gain > enough and best.misfit > MIN_MISFIT
-    if asked or (blurred and (best.model != "none" or not sparing or _resembled(pair, evidence))):
+    look = _Look(frame, config, shot, terms)
+    found = look.followed()
+    best = look.accepted(preferred(found[1:] or found), found[0])
+    evidence = look.unexplained(best)
+    if look.reason(found, best, evidence) is None:
+        return look.described(best, min(frame.evidence, evidence.gain))
+    found = look.searched(found, best, evidence)
+    best = look.accepted(preferred(found), found[0])
+    return look.described(best, look.unexplained(best).gain)
+
+
+class _Look:
+    """One look at a frame, with the present scene."""
+
+    def __init__(self, frame: FrameFormation, config: FormationConfig, shot: Shot, terms: Terms) -> None:
+        self._frame, self._config, self._shot, self._terms = frame, config, shot, terms
+        self._show(margin_for(frame.reach_px * shot.factor, shot.camera))
+
+    def _show(self, margin: int) -> None:
+        """Render the scene with a margin."""
+        shot, self._margin = self._shot, margin
+        self._rendered = shot.render(widened(shot.camera, margin))
+        self._pair = frame_pair(self._rendered, shot.affine, shot.target, shot.mask, shot.camera, margin)
+
+    @property
+    def _held(self) -> FrameMotion | None:
+        """The measured skew, which all models of the frame have; None if none was measured."""
+        measured = self._terms.measured
+        if measured is None or not measured.rolls:
+            return None
+        return measured.read(self._shot.camera, finest_level(self._pair).median)
+
+    def followed(self) -> list[MotionFit]:
+        """Return the fit without blur and defocus, then those of the known or of the measured motion."""
+        frame, terms = self._frame, self._terms
+        known = _scaled(frame.motion, self._shot.factor)
+        if terms.measured is not None and not frame.searched:
+            return [self._resting(), *self._measured(terms.measured, known)]
+        held = self._held
+        if held is None:
+            return refine(self._pair, frame.model, known, pose=terms.pose, curve=terms.curve)
+        known = replace(known, skew=held.skew, columns=held.columns)
+        found = refine(self._pair, "blur", known, pose=terms.pose, curve=terms.curve)
+        return [self._resting(), *(replace(fit, model=named(fit.model, fit.motion)) for fit in found[1:])]
+
+    def _resting(self) -> MotionFit:
+        """Return the fit without blur and defocus."""
+        level, held = finest_level(self._pair), self._held
+        if held is None:
+            return level.evaluate("none", FrameMotion(median_depth=level.median))
+        return level.evaluate("skew", held)
+
+    def _measured(self, measured: MeasuredPath, known: FrameMotion) -> list[MotionFit]:
+        """Return fits of the measured motion, by the known exposure time or by the best of several."""
+        camera, depth = self._shot.camera, finest_level(self._pair).median
+        found = []
+        if known.exposure_s > 0.0:
+            path = measured.exposed(known.exposure_s, camera, depth)
+            curves = (path.bend, path.cube) if known.bend.any() else (known.bend, known.cube)
+            path = replace(path, pose=known.pose, blur=known.blur, bend=curves[0], cube=curves[1])
+            found.append(self._corrected(measured, path))
+        if self._frame.draws == 0 or self._terms.curve:
+            times = EXPOSURES * measured.frame_s
+            fits = measured_fits(self._pair, [measured.exposed(time, camera, depth) for time in times])
+            found += [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.misfit).motion)]
+        return found
+
+    def _corrected(self, measured: MeasuredPath, path: FrameMotion) -> MotionFit:
+        camera = self._shot.camera
+        precision = measured.blur_precision(path.exposure_s, camera, path.median_depth)
+        blur = measured.exposed(path.exposure_s, camera, path.median_depth).blur
+        return corrected(self._pair, path, blur, precision, pose=self._terms.pose)
+
+    def accepted(self, best: MotionFit, still: MotionFit) -> MotionFit:
+        """Return ``best`` if it explains enough more than ``still``, else ``still``.
+
+        The model that the frame had needs only half as much, and so does a measured motion.
+        """
+        known = best.model == self._frame.model or best.motion.exposure_s > 0.0
+        gain = explained_share(best.misfit, still.misfit)
+        return best if gain >= self._config.accept * (0.5 if known else 1.0) else still
+
+    def unexplained(self, fit: MotionFit) -> BlurEvidence:
+        """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
+        return _unexplained(self._pair, self._rendered, fit)
+
+    def reason(self, found: list[MotionFit], best: MotionFit, evidence: BlurEvidence) -> Reason | None:
+        """Return the reason to search the frame; None if there is none."""
+        frame, terms, rolls = self._frame, self._terms, self._terms.shutter == "rolls"
+        if terms.measured is None:
+            # A formation that was found under the other assumption about the shutter is searched again.
+            unmeasured = frame.skew_gain is None or frame.skew_gain > self._config.accept
+            if terms.shutter == "tested" or (rolls and unmeasured and _admitted(frame.model, rolling=False)):
+                return Reason.SHUTTER
+            if frame.draws == 0 and not terms.sparing:
+                return Reason.FIRST
+            if not _admitted(frame.model, rolls):
+                return Reason.MODEL
+            if terms.curve and (rolls or preferred(found[1:] or found).motion.order > 1):
+                return Reason.CURVE
+        enough = max(DOUBTED_EVIDENCE if terms.doubted else EVIDENCE, GROWN_EVIDENCE * frame.evidence)
+        blurred = evidence.gain > enough and best.misfit > MIN_MISFIT
+        known = best.model not in ("none", "skew")
+        if blurred and (known or not terms.sparing or self._resembles(evidence)):
+            return Reason.BLUR
+        return None
+
+    def _resembles(self, evidence: BlurEvidence) -> bool:
+        """Return True unless half of the blur that the test found raises the misfit too much (`WORSE`)."""
+        level = finest_level(self._pair)
+        blur = replace(blur_along(0.5 * evidence.length, evidence.angle), median_depth=level.median)
+        return level.evaluate("blur", blur).explained > WORSE
+
+    def searched(self, followed: list[MotionFit], best: MotionFit, evidence: BlurEvidence) -> list[MotionFit]:
+        """Return the fits of a search, the one without blur first, with that of the followed motion."""
+        camera, terms = self._shot.camera, self._terms
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
-        if wide > margin:
-            margin, rendered = wide, render(widened(camera, wide))
-            pair = frame_pair(rendered, affine, target, mask, camera, margin)
-        whole = evidence if best.model == "none" else _unexplained(pair, rendered, found[0])
+        if wide > self._margin:
+            self._show(wide)
+        resting = self._resting() if self._held is not None else followed[0]
+        whole = evidence if best.model == resting.model else self.unexplained(resting)
+        skews = terms.shutter != "still" and terms.measured is None
         found = search(
-            pair,
+            self._pair,
             start=None if skews else blur_along(whole.length, whole.angle),
             skew=skews,
-            defocus=rolling or whole.disc_gain > whole.line_gain,
-            pose=pose,
+            defocus=terms.shutter == "rolls" or whole.disc_gain > whole.line_gain,
+            pose=terms.pose,
+            held=self._held,
         )
         if skews:
-            frame = replace(frame, skew_gain=_skew_gain(found))
-        if followed.model != "none":
-            found += refine(pair, followed.model, followed.motion, pose=pose)[1:]
-        best = preferred([e for e in found if _admitted(e.model, rolling)])
-        best = _accepted(best, found[0], frame.model, config)
-        left = _unexplained(pair, rendered, best).gain
-    return _described(replace(frame, evidence=left), best, factor, camera, rendered, margin)
+            self._frame = replace(self._frame, skew_gain=_skew_gain(found))
+        known = preferred(followed[1:] or followed)
+        if known.model not in ("none", "skew") or (known.model == "skew" and self._held is None):
+            motion, model = known.motion, known.model
+            if motion.exposure_s > 0.0 or self._held is not None:
+                found.append(finest_level(self._pair).evaluate(model, motion))
+            else:
+                found += refine(self._pair, model, motion, pose=terms.pose)[1:]
+        rolls = terms.shutter == "rolls" or self._held is not None
+        return [fit for fit in found if _admitted(fit.model, rolls)]
 
-
-def _accepted(best: MotionFit, still: MotionFit, before: Model, config: FormationConfig) -> MotionFit:
-    """Return ``best`` if it explains enough, else ``still``. The model ``before`` needs only half as much."""
-    return best if best.explained >= config.accept * (0.5 if best.model == before else 1.0) else still
+    def described(self, best: MotionFit, evidence: float) -> FrameFormation:
+        """Return the frame with its new fit and the evidence of further blur."""
+        frame, shot = replace(self._frame, evidence=evidence), self._shot
+        return _described(frame, best, shot.factor, shot.camera, self._rendered, self._margin)
 
 
 def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvidence:
@@ -179,13 +321,6 @@ def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvide
     elif pair.margin:
         shown = shown[pair.margin : -pair.margin, pair.margin : -pair.margin]
     return blur_evidence(np.ascontiguousarray(shown), pair.observed, pair.weight)
-
-
-def _resembled(pair: FramePair, evidence: BlurEvidence) -> bool:
-    """Return True unless half of the blur that the test found raises the misfit too much (`WORSE`)."""
-    level = finest_level(pair)
-    blur = replace(blur_along(0.5 * evidence.length, evidence.angle), median_depth=level.median)
-    return level.evaluate("blur", blur).explained > WORSE
 
 
 def _admitted(model: Model, rolling: bool) -> bool:
@@ -284,16 +419,17 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
     row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws", "evidence")}
     for name in TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
-    row |= {name: getattr(motion, name) for name in LENS} | {"order": motion.order}
+    row |= {name: getattr(motion, name) for name in (*LENS, "columns")} | {"order": motion.order}
     return row | {name: getattr(frame, name) for name in (*MEASURED, "skew_gain")}
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame of a row from `as_row`. Older tables lack ``draws``, curves and ``evidence``."""
+    """Return the frame of a row from `as_row`. Older tables lack some columns."""
     vector = np.array([row.get(f"{name}_{axis}") or 0.0 for name in TWISTS for axis in AXES])
+    lens = {name: row[name] for name in LENS if row.get(name) is not None}
     return FrameFormation(
         row["frame_id"],
-        FrameMotion(**{name: row[name] for name in LENS}).with_vector(vector),
+        FrameMotion(**lens, columns=bool(row.get("columns"))).with_vector(vector),
         row["model"],
         evidence=row.get("evidence") or 0.0,
         draws=row.get("draws") or 0,

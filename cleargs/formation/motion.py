@@ -45,6 +45,8 @@ class FrameMotion:
     """Motion from the start to the end of a row's exposure: the part of the path that is linear in time."""
     skew: ArrayF64 = field(default_factory=_still)
     """Motion from the first to the last row's exposure (rolling shutter); 0 at the middle row."""
+    columns: bool = False
+    """True if the columns are read one after the other: ``skew`` is from the first to the last column."""
     pose: ArrayF64 = field(default_factory=_still)
     """Motion from the given pose of the frame to the mean pose of its exposure."""
     bend: ArrayF64 = field(default_factory=_still)
@@ -54,6 +56,8 @@ class FrameMotion:
     focus: float = 1.0
     """Nearness in focus: the median depth over the depth in focus."""
     median_depth: float = 1.0
+    exposure_s: float = 0.0
+    """Exposure time, s, if the blur is the measured motion during it; 0: none, or a searched blur."""
 
     @property
     def vector(self) -> ArrayF64:

@@ -7,6 +7,7 @@ coarse to fine.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,8 @@ from cleargs.formation.comparison import (
 from cleargs.formation.motion import BEND, BLUR, CUBE, POSE, SKEW, TWIST, TWISTS, FrameMotion, Model
 from cleargs.types import ArrayF64
 
+SHARED_PIXELS = 50.0
+"""Number of pixels whose errors count as one, where an image corrects a measured motion."""
 WARM_STEPS = 2
 """Number of Gauss-Newton steps of a fit that starts from the previous one."""
 
@@ -70,21 +73,22 @@ def search(
     skew: bool = True,  # try models with a rolling shutter, which doubles the time
     defocus: bool = True,  # try a disc of defocus, which doubles the time
     pose: bool = False,  # correct the pose together with each motion
+    held: FrameMotion | None = None,  # motion with a known skew, which all models have
 ) -> list[MotionFit]:
     """Fit every model from scratch.
 
-    Return the fit of ``none`` first, then those of each model. Models with a blur have one per order of the
-    path that was tried.
+    With a skew that is ``held``, no other skew is tried. Return the fit without blur first, then those of
+    each model. Models with a blur have one per order of the path that was tried.
     """
     levels = [Level(pair, scale) for scale in scales(pair)]
     coarse = levels[0]
-    still = FrameMotion(median_depth=coarse.median)
-    models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
+    still = replace(held or FrameMotion(), median_depth=coarse.median)
+    models: tuple[Model, ...] = ("both", "blur", "skew") if skew and held is None else ("blur",)
     starts = _starts(coarse, still) if start is None else _near(coarse, still, start)
     begun = _best(coarse, starts, models[0], LEVELS[0][1], pose)
     found: list[tuple[Model, FrameMotion]] = [("none", still)]
     for model in models:
-        straight = curved = _restricted(begun, model)
+        straight = curved = _restricted(begun, model, still)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
             nearer = min((straight, still), key=level.cost)
             straight = _best(level, [nearer], model, steps, pose)
@@ -102,16 +106,64 @@ def search(
         for level in levels[1:]:
             disc = _narrowed(level, disc)
         found.append(("defocus", disc))
-    return [levels[-1].evaluate(model, motion) for model, motion in found]
+    return [levels[-1].evaluate(named(model, still), motion) for model, motion in found]
+
+
+def named(model: Model, motion: FrameMotion) -> Model:
+    """Return the model of a motion: with its skew, a frame of the model ``blur`` is one of ``both``."""
+    with_skew: dict[Model, Model] = {"none": "skew", "blur": "both"}
+    return with_skew.get(model, model) if motion.skew.any() else model
+
+
+def measured_fits(pair: FramePair, motions: Sequence[FrameMotion]) -> list[MotionFit]:
+    """Return two fits of measured motions: the best of ``motions``, and the same without curves.
+
+    The best is chosen on the pixels that take part in fits.
+    """
+    level = finest_level(pair)
+    best = min(motions, key=level.cost)
+    still = np.zeros(TWIST)
+    paths = [best, replace(best, pose=still, bend=still, cube=still)]
+    return [level.evaluate(named("blur", path), path) for path in paths]
+
+
+def corrected(
+    pair: FramePair,
+    motion: FrameMotion,
+    measured: ArrayF64,  # [6] blur, px
+    precision: ArrayF64,  # [6, 6] inverse of its covariance, per px^2
+    *,
+    pose: bool,
+) -> MotionFit:
+    """Correct the blur of ``motion``, held by its measurement, and with ``pose`` the pose.
+
+    Skew and curves stay.
+    """
+    level = finest_level(pair)
+    parts = [POSE, BLUR] if pose else [BLUR]
+    active = np.concatenate([np.arange(len(TWISTS) * TWIST)[part] for part in parts])
+    variance = (1.25 * level.evaluate("blur", motion).misfit) ** 2  # of normal errors with this mean
+    matrix = np.zeros((len(active), len(active)))
+    matrix[-TWIST:, -TWIST:] = SHARED_PIXELS * variance * precision
+    middle = np.concatenate([motion.pose, measured]) if pose else measured
+    found = _descend(level, motion, active, WARM_STEPS, prior=(middle, matrix))
+    return level.evaluate(named("blur", found), found)
 
 
 def refine(
-    pair: FramePair, model: Model, motion: FrameMotion, *, pose: bool = False, curve: bool = False
+    pair: FramePair,
+    model: Model,
+    motion: FrameMotion,
+    *,
+    pose: bool = False,
+    curve: bool = False,
+    held: FrameMotion | None = None,
 ) -> list[MotionFit]:
     """Fit ``model`` again at the finest level, from the ``motion`` of the last fit.
 
-    ``pose`` corrects the pose too, and ``curve`` tries the next order of the path. Return the fit of ``none``
-    first, then that of ``model`` if it is not ``none``, then that of the next order if it was tried.
+    ``pose`` corrects the pose too, and ``curve`` tries the next order of the path. The skew of ``held`` does
+    not change. Return the fit of ``none`` first, then that of ``model`` if it is not ``none``, then that of
+    the next order if it was tried.
     """
     level = finest_level(pair)
     if model == "none":
@@ -145,8 +197,8 @@ def _promising(level: Level, paths: list[FrameMotion], still: FrameMotion) -> Fr
     return paths[costs.index(min(costs))] if enough else None
 
 
-def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
-    vector = np.zeros_like(motion.vector)
+def _restricted(motion: FrameMotion, model: Model, still: FrameMotion) -> FrameMotion:
+    vector = still.vector
     for part in (POSE, *_ACTIVE[model]):
         vector[part] = motion.vector[part]
     return motion.with_vector(vector)
@@ -230,15 +282,23 @@ def _narrowed(level: Level, disc: FrameMotion) -> FrameMotion:
 
 
 def _descend(
-    level: Level, motion: FrameMotion, active: NDArray[np.int64], steps: int, unknowns: ArrayF64 | None = None
+    level: Level,
+    motion: FrameMotion,
+    active: NDArray[np.int64],
+    steps: int,
+    unknowns: ArrayF64 | None = None,
+    prior: tuple[ArrayF64, ArrayF64] | None = None,
 ) -> FrameMotion:
     """Run Levenberg-Marquardt over the ``active`` numbers from ``motion``.
 
     ``unknowns`` [A, U] are the combinations of the active numbers that may change; None: all of them.
+    ``prior`` has the expected active numbers [A] and the matrix [A, A] that holds them there.
     """
     vector, cost, damping = motion.vector, level.cost(motion), DAMPING
     for _ in range(steps):
         matrix, side = level.normal_equations(motion, active)
+        if prior is not None:
+            matrix, side = matrix + prior[1], side + prior[1] @ (prior[0] - vector[active])
         if unknowns is not None:
             matrix, side = unknowns.T @ matrix @ unknowns, unknowns.T @ side
         diagonal = matrix.diagonal()

@@ -61,6 +61,18 @@ FORMATION = pa.schema(
         ),
         column("focus", pa.float64(), "nearness in focus: median depth over the depth in focus"),
         column("median_depth", pa.float64(), "median depth of the frame, world units"),
+        column(
+            "exposure_s",
+            pa.float64(),
+            "exposure time, s, of a blur that is the measured motion during it; 0: the blur was searched",
+            nullable=True,
+        ),
+        column(
+            "columns",
+            pa.bool_(),
+            "true if the columns are read one after the other, not the rows",
+            nullable=True,
+        ),
     ]
 )
 

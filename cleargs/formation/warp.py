@@ -103,6 +103,7 @@ def displacement_fields(
     numbers[[layout.FX, layout.FY, layout.CX, layout.CY]] = camera.fx, camera.fy, camera.cx, camera.cy
     numbers[layout.MEDIAN] = motion.median_depth
     numbers[[layout.DISC, layout.FOCUS]] = scale * motion.disc_px, motion.focus
+    numbers[[layout.READ_ACROSS, layout.READ_DOWN]] = motion.columns, not motion.columns
     numbers[layout.TWISTS :] = scale * motion.vector
     return backend_for(depth.device).displacements(depth, alpha, torch.from_numpy(numbers), margin=margin)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -20,7 +20,8 @@ from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.deblur import deblur
 from cleargs.formation.exposure import read_exposure, write_exposure
-from cleargs.formation.frame import FrameFormation, fit_motion
+from cleargs.formation.frame import FrameFormation, Shot, Terms, fit_motion
+from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import TOLERANCE, read_movement, still_pixels, write_movement
 from cleargs.formation.observed import (
     MAX_EVALUATED,
@@ -89,8 +90,11 @@ class TrainedScene:
     StoreError is raised if one is missing or damaged.
     """
 
-    def __init__(self, folder: Path, device: str = "cpu") -> None:
-        self.folder = folder
+    def __init__(
+        self, folder: Path, device: str = "cpu", measured: Mapping[int, MeasuredPath] | None = None
+    ) -> None:
+        """``measured`` are the motions of ingest, by frame_id, for trainings and looks at frames."""
+        self.folder, self._motions = folder, measured or {}
         self._device = device
         self.scene = read_ply(folder / SCENE).to(device)
         self._written_exposure = read_exposure(folder / EXPOSURE)
@@ -150,13 +154,18 @@ class TrainedScene:
             found = fit_motion(
                 found,
                 FormationConfig(),
-                view.camera,
-                affine,
-                torch.from_numpy(observed),
-                None if mask is None else torch.from_numpy(mask),
-                self._with_depth,
-                doubted=True,
-                rolling=rolls(self.formations.values()),
+                Shot(
+                    view.camera,
+                    affine,
+                    torch.from_numpy(observed),
+                    None if mask is None else torch.from_numpy(mask),
+                    self._with_depth,
+                ),
+                Terms(
+                    doubted=True,
+                    shutter="rolls" if rolls(self.formations.values()) else "still",
+                    measured=self._motions.get(view.frame_id),
+                ),
             )
         if found.model == "none":
             return None
@@ -247,6 +256,7 @@ class TrainedScene:
                 known=self.formations,
                 moving=self.moving,
                 tolerance=TOLERANCE if self.moving else 0.0,
+                measured=self._motions,
             )
             even = sum(view.kind == "pseudo" for view in views) / len(views)
             share = even if pseudo_share == "even" else pseudo_share * repaired
@@ -270,7 +280,7 @@ class TrainedScene:
             write_movement(folder / MOVEMENT, formation.moving)
             write_ply(folder / SCENE, result.scene)  # last: it marks the training as done
         (folder / CHECKPOINT).unlink(missing_ok=True)
-        return TrainedScene(folder, self._device)
+        return TrainedScene(folder, self._device, self._motions)
 
 
 def _deblurred(formed: FormedView, render: Render, observed: ImageF32, mask: MaskBool | None) -> ImageF32:

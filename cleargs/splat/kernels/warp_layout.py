@@ -28,9 +28,11 @@ CY = 3
 MEDIAN = 4  # median depth, scene units
 DISC = 5  # radius of the defocus disc per unit of nearness
 FOCUS = 6  # nearness that is in focus
-TWISTS = 7  # pose, blur, skew, bend and cube: translation and rotation, six numbers each
-CURVES = 25  # first number of bend; bend and cube are zero on a straight path
-MOTION_COLUMNS = 37
+READ_ACROSS = 7  # 1 if columns are read one after the other, else 0
+READ_DOWN = 8  # 1 if rows are
+TWISTS = 9  # pose, blur, skew, bend and cube: translation and rotation, six numbers each
+CURVES = 27  # first number of bend; bend and cube are zero on a straight path
+MOTION_COLUMNS = 39
 
 BEND_REACH = 1.0 / 6.0
 CUBE_REACH = 1.0 / 20.0

@@ -176,7 +176,7 @@ def displacements(
     depth: ArrayF32,  # [H + 2 margin, W + 2 margin] accumulated
     alpha: ArrayF32,  # [H + 2 margin, W + 2 margin]
     margin: int,
-    motion: ArrayF32,  # [37]: see `warp_layout`
+    motion: ArrayF32,  # [39]: see `warp_layout`
     offset: ArrayF32,  # [2, H, W] written
     sweep: ArrayF32,  # [2, H, W] written
     radius: ArrayF32,  # [H, W] written
@@ -193,7 +193,7 @@ def displacements(
     fx, fy, cx, cy = motion[layout.FX], motion[layout.FY], motion[layout.CX], motion[layout.CY]
     twists = motion[layout.TWISTS :].reshape(5, 6)
     for row in prange(height):
-        down = np.float32((row + 0.5) / height - 0.5)
+        down = motion[layout.READ_DOWN] * np.float32((row + 0.5) / height - 0.5)
         y = (np.float32(row) + np.float32(0.5) - cy) / fy
         farthest = 0.0
         for column in range(width):
@@ -207,8 +207,9 @@ def displacements(
                 # Pose and skew give the offset, blur gives the sweep.
                 tx, ty, tz, rx, ry, rz = _twist(twists, part)
                 if part == 0:
-                    tx, ty, tz = tx + down * twists[2, 0], ty + down * twists[2, 1], tz + down * twists[2, 2]
-                    rx, ry, rz = rx + down * twists[2, 3], ry + down * twists[2, 4], rz + down * twists[2, 5]
+                    read = down + motion[layout.READ_ACROSS] * np.float32((column + 0.5) / width - 0.5)
+                    tx, ty, tz = tx + read * twists[2, 0], ty + read * twists[2, 1], tz + read * twists[2, 2]
+                    rx, ry, rz = rx + read * twists[2, 3], ry + read * twists[2, 4], rz + read * twists[2, 5]
                 field = offset if part == 0 else sweep
                 along_x, along_y = _flow(x, y, near, (tx, ty, tz, rx, ry, rz))
                 field[0, row, column] = along_x

@@ -76,11 +76,13 @@ def displace(
     x = (column.to(tl.float32) + 0.5 - tl.load(motion + layout.CX)) / fx
     y = (row.to(tl.float32) + 0.5 - tl.load(motion + layout.CY)) / fy
     down = (row.to(tl.float32) + 0.5) / height - 0.5
+    across = (column.to(tl.float32) + 0.5) / width - 0.5
+    read = tl.load(motion + layout.READ_DOWN) * down + tl.load(motion + layout.READ_ACROSS) * across
     # Pose and skew give the offset, blur gives the sweep.
     pose_x, pose_y = flow(x, y, near, twist_of(motion, 0))
     skew_x, skew_y = flow(x, y, near, twist_of(motion, 2))
-    tl.store(offset + pixel, pose_x + down * skew_x, mask=inside)
-    tl.store(offset + plane + pixel, (pose_y + down * skew_y) * (fy / fx), mask=inside)
+    tl.store(offset + pixel, pose_x + read * skew_x, mask=inside)
+    tl.store(offset + plane + pixel, (pose_y + read * skew_y) * (fy / fx), mask=inside)
     blur_x, blur_y = flow(x, y, near, twist_of(motion, 1))
     tl.store(sweep + pixel, blur_x, mask=inside)
     tl.store(sweep + plane + pixel, blur_y * (fy / fx), mask=inside)
@@ -263,7 +265,7 @@ def follow_curve(image, curve, out, slope, pixels, FROM: tl.constexpr, TO: tl.co
 
 @memory_errors()
 def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) -> DisplacementFields:
-    """See ``cleargs.formation.warp.displacement_fields``. ``motion`` [37] is on the CPU."""
+    """See ``cleargs.formation.warp.displacement_fields``. ``motion`` [39] is on the CPU."""
     height, width = (side - 2 * margin for side in depth.shape)
     offset, sweep = depth.new_empty(2, height, width), depth.new_empty(2, height, width)
     radius = depth.new_empty(height, width)
