@@ -117,14 +117,15 @@ def spread_out(xy: ArrayF64, at_most: int = MAX_POINTS) -> NDArray[np.int64]:
 
 
 def measure(tracks: Tracks, readout: float = 0.0) -> MeasuredMotion | None:
-    """Fit the path of the camera to ``tracks``; None if there are too few, or all on one side of the frame.
+    """Fit the path of the camera to ``tracks``; None if there are too few.
 
+    The first and the last frame of a video have neighbours on one side, and so a path of second order.
     ``readout`` is the time, s, from the first row's exposure to the last one's.
     """
     counted = np.isfinite(tracks.places).all(axis=2).sum(axis=1)
     used = np.flatnonzero((counted >= MIN_TRACKS) & (tracks.times != 0.0))
     near = [side[np.argmin(np.abs(tracks.times[side]))] for side in _sides(tracks.times, used)]
-    if len(near) < 2:
+    if not near:
         return None
     path, covariance, off = _fitted(tracks, used, readout)
     closer, _, _ = _fitted(tracks, np.sort(near), readout)
@@ -158,7 +159,8 @@ def _fitted(
     tracks: Tracks, used: NDArray[np.int64], readout: float
 ) -> tuple[ArrayF64, ArrayF64, ArrayF64]:  # [ORDER, 6], [6, 6], [M]
     """Return the path through the neighbours ``used``, the covariance of its speed, and the errors, px."""
-    order = min(ORDER, len(used))
+    one_sided = len(_sides(tracks.times, used)) < 2
+    order = min(2 if one_sided else ORDER, len(used))
     which, point = np.nonzero(np.isfinite(tracks.places[used]).all(axis=2))
     which = used[which]
     points = tracks.points[point]

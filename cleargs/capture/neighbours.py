@@ -38,7 +38,7 @@ class Neighbourhood:
 
 
 def neighbourhoods(capture: Capture) -> list[Neighbourhood]:
-    """Return the frames of ``capture`` that have a neighbour before and one after them, in order."""
+    """Return the frames of ``capture`` that have neighbours, in order."""
     if capture.kind != "video":
         return _in_folder(capture)
     found = []
@@ -98,7 +98,7 @@ def _number_of(name: str) -> tuple[str, int] | None:
 
 
 def _neighbourhood(number: int, times: list[float], others: list[SourceFrame]) -> list[Neighbourhood]:
-    if not times or min(times) >= 0.0 or max(times) <= 0.0:
+    if not times:
         return []
     order = sorted(range(len(times)), key=lambda k: times[k])
     return [Neighbourhood(number, tuple(times[k] for k in order), tuple(others[k] for k in order))]

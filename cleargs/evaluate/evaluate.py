@@ -22,6 +22,8 @@ from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, me
 from cleargs.evaluate.references import Reference, ReferenceView, matching
 from cleargs.evaluate.refinement import refine_pose
 from cleargs.files import disk_errors
+from cleargs.formation.frame import read_out
+from cleargs.formation.observed import FormedView
 from cleargs.manifest import versions
 from cleargs.media.exr import read_depth
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
@@ -53,6 +55,8 @@ class _Prediction:
     """Pixels in which a scene shows something behind the sparse points; None if these are not known."""
     covered: float | None = None
     """See `covered_share`; None if the true depth is not known."""
+    as_filmed: ArrayF64 | None = None
+    """The render with the skew of the rolling shutter; None if no readout was measured."""
 
 
 Predict = Callable[[ReferenceView, ImageU8, MaskBool | None], _Prediction]
@@ -166,7 +170,12 @@ def _renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None) -> Predi
                     hint="delete the depth, or write it at the size of the images",
                 )
             covered = covered_share(scene, camera, surface / view.unit, mask)
-        return _Prediction(*render(camera), refinement, far, covered)
+        filmed = None
+        if view.readout is not None:
+            formed = FormedView(camera, 1.0, formation=read_out(view.readout))
+            seen = formed.forward(engine.view(scene, formed.camera, depth=True))
+            filmed = seen.clamp(0.0, 1.0).numpy().astype(np.float64)
+        return _Prediction(*render(camera), refinement, far, covered, filmed)
 
     return predict
 
@@ -238,6 +247,9 @@ def _evaluate(
             far=None if prediction.far is None else metrics.region(pixels, target, prediction.far, mask),
             clipped=metrics.region(pixels, target, metrics.clipped_pixels(target), mask),
             covered=prediction.covered,
+            psnr_as_filmed=None
+            if prediction.as_filmed is None
+            else metrics.psnr(to_uint8(prediction.as_filmed), target, mask),
         )
 
     images: list[ImageResult] = []
@@ -271,6 +283,7 @@ def _evaluate(
         far=metrics.pooled(image.far for image in images),
         clipped=metrics.pooled(image.clipped for image in images),
         covered=mean_of(image.covered for image in images),
+        psnr_as_filmed=mean_of(image.psnr_as_filmed for image in images),
         unavailable=measures.unavailable,
         weights=measures.weights,
         versions={

@@ -26,6 +26,8 @@ from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
+from cleargs.formation.measured import load_paths
+from cleargs.formation.motion import FrameMotion
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
@@ -63,6 +65,8 @@ class ReferenceView:
     """EXR of the true depth, as `cleargs synth` writes it; None if it is not known."""
     unit: float = 1.0
     """Length of a unit of the scene, in the units of ``depth``."""
+    readout: FrameMotion | None = None
+    """Measured motion during the readout of a rolling shutter, px; None if none is known."""
 
     @property
     def pose(self) -> Pose:
@@ -254,13 +258,16 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
             hint="give --reference DIR, or run it again with --set ingest.holdout=every:8",
         )
     views = []
+    measured = load_paths(ingest)
     stems = Counter(stem_of(frame.name) for frame in test)
     for frame in test:
         stem = stem_of(frame.name)
         if stems[stem] > 1:  # for example the cameras of a rig, in separate folders
             stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
-        views.append(ReferenceView(stem, view.camera, view.load))
+        path = measured.get(frame.frame_id)
+        readout = path.read(view.camera) if path is not None and path.rolls else None
+        views.append(ReferenceView(stem, view.camera, view.load, readout=readout))
     return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 

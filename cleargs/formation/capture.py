@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
-from cleargs.formation.frame import FrameFormation, Shot, Terms, fit_motion, packed, unpacked
+from cleargs.formation.frame import FrameFormation, Shot, Terms, fit_motion, packed, read_out, unpacked
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import Movement
 from cleargs.formation.observed import FormedView
@@ -96,11 +96,9 @@ class CaptureFormation:
         filmed = sorted((v for v in weighted if v.kind == "real"), key=lambda view: view.frame_id)
         real = [view.frame_id for view in filmed]
         known, self._measured = known or {}, measured or {}
-        self._frames = {
-            view.frame_id: known.get(view.frame_id) or _unseen(view, self._measured.get(view.frame_id))
-            for view in filmed
-        }
+        self._frames = {view.frame_id: known.get(view.frame_id) or self._unseen(view) for view in filmed}
         judged = sum(frame_id in self._measured for frame_id in real)
+        self._readout_found = any(path.rolls for path in self._measured.values())
         self._shutter_measured = judged >= max(MIN_TIMED_FRAMES, MEASURED_SHARE * len(real))
         if self._rolls():  # a training begins with a search of each frame
             self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
@@ -214,7 +212,7 @@ class CaptureFormation:
         terms = Terms(
             pose=frame_id in self._posed,
             doubted=self._weights[frame_id] < DOUBTED,
-            shutter="rolls" if self._rolls() else tested,
+            shutter="rolls" if self._rolls(frame_id) else tested,
             curve=_searched_again(frame.draws // self._config.every),
             sparing=self._draft or self._sharp(),
             measured=self._measured.get(frame_id),
@@ -253,9 +251,21 @@ class CaptureFormation:
             return "exposure is not finite"
         return None
 
-    def _rolls(self) -> bool:
-        """Return True if frames without a measured motion may have a skew."""
-        return not self._shutter_measured and rolls(self._frames.values())
+    def _unseen(self, view: TrainingView) -> FrameFormation:
+        """Return the formation of a frame before the first look: its measured skew."""
+        path = self._measured.get(view.frame_id)
+        if path is None or not path.rolls:
+            return FrameFormation(view.frame_id)
+        return read_out(path.read(view.camera), view.frame_id)
+
+    def _rolls(self, frame_id: int | None = None) -> bool:
+        """Return True if frames, or this one, may have a skew that must be searched.
+
+        If ingest found a readout, these are the frames without a measured motion.
+        """
+        if self._shutter_measured:
+            return frame_id is not None and frame_id not in self._measured and self._readout_found
+        return rolls(self._frames.values())
 
     def _asks(self, frame_id: int) -> bool:
         """Return True if a frame must still be tested for a rolling shutter.
@@ -292,15 +302,6 @@ class CaptureFormation:
         models = [frame.model for frame in self._frames.values() if frame.draws > 0]
         modelled = len(models) - models.count("none")
         return len(models) >= MIN_SEARCHED_FRAMES and modelled <= SHARP_SHARE * len(models)
-
-
-def _unseen(view: TrainingView, measured: MeasuredPath | None) -> FrameFormation:
-    """Return the formation of a frame before the first look: its measured skew."""
-    if measured is None or not measured.rolls:
-        return FrameFormation(view.frame_id)
-    motion = measured.read(view.camera)
-    reach = 0.5 * float(np.abs(motion.skew).sum())
-    return FrameFormation(view.frame_id, motion, "skew", reach_px=reach)
 
 
 def _searched_again(looks: int) -> bool:

@@ -201,6 +201,8 @@ class Level:
         if motion.skew.any():
             read = self._across if motion.columns else self._down[:, None]
             offset = offset + flow(motion.skew) * read
+            if motion.skew_bend.any():
+                offset = offset + flow(motion.skew_bend) * read**2
         radius = self._nowhere[0]
         if motion.disc_px > 0.0:
             disc = np.float32(motion.disc_px * self.scale)

@@ -100,6 +100,12 @@ class FrameFormation:
         return explained_share(self.misfit, self.misfit_still)
 
 
+def read_out(skew: FrameMotion, frame_id: int = -1) -> FrameFormation:
+    """Return the formation of a frame with a skew alone."""
+    # No pixel moves farther than at the first and at the last row.
+    return FrameFormation(frame_id, skew, "skew", reach_px=0.5 * float(np.abs(skew.skew).sum()))
+
+
 def described(frame: FrameFormation) -> str:
     """Return the formation in a few words: ``blur 5.2 px, skew 1.4 px``."""
     lengths = {"blur": frame.blur_px, "skew": frame.skew_px, "defocus": frame.defocus_px}
@@ -186,8 +192,13 @@ class _Look:
         self._pair = frame_pair(self._rendered, shot.affine, shot.target, shot.mask, shot.camera, margin)
 
     @property
+    def _known(self) -> FrameMotion:
+        """The known motion, at the size of this look."""
+        return _scaled(self._frame.motion, self._shot.factor)
+
+    @property
     def _held(self) -> FrameMotion | None:
-        """The measured skew, which all models of the frame have; None if none was measured."""
+        """The measured skew, which all models have; None if no readout was measured."""
         measured = self._terms.measured
         if measured is None or not measured.rolls:
             return None
@@ -195,15 +206,13 @@ class _Look:
 
     def followed(self) -> list[MotionFit]:
         """Return the fit without blur and defocus, then those of the known or of the measured motion."""
-        frame, terms = self._frame, self._terms
-        known = _scaled(frame.motion, self._shot.factor)
+        frame, terms, held = self._frame, self._terms, self._held
         if terms.measured is not None and not frame.searched:
-            return [self._resting(), *self._measured(terms.measured, known)]
-        held = self._held
+            return [self._resting(), *self._measured(terms.measured)]
         if held is None:
-            return refine(self._pair, frame.model, known, pose=terms.pose, curve=terms.curve)
-        known = replace(known, skew=held.skew, columns=held.columns)
-        found = refine(self._pair, "blur", known, pose=terms.pose, curve=terms.curve)
+            return refine(self._pair, frame.model, self._known, pose=terms.pose, curve=terms.curve)
+        model: Model = "defocus" if frame.model == "defocus" else "blur"
+        found = refine(self._pair, model, self._known, pose=terms.pose, curve=terms.curve)
         return [self._resting(), *(replace(fit, model=named(fit.model, fit.motion)) for fit in found[1:])]
 
     def _resting(self) -> MotionFit:
@@ -213,32 +222,36 @@ class _Look:
             return level.evaluate("none", FrameMotion(median_depth=level.median))
         return level.evaluate("skew", held)
 
-    def _measured(self, measured: MeasuredPath, known: FrameMotion) -> list[MotionFit]:
+    def _measured(self, measured: MeasuredPath) -> list[MotionFit]:
         """Return fits of the measured motion, by the known exposure time or by the best of several."""
-        camera, depth = self._shot.camera, finest_level(self._pair).median
-        found = []
+        known = self._known
+        found: list[MotionFit] = []
         if known.exposure_s > 0.0:
-            path = measured.exposed(known.exposure_s, camera, depth)
-            curves = (path.bend, path.cube) if known.bend.any() else (known.bend, known.cube)
-            path = replace(path, pose=known.pose, blur=known.blur, bend=curves[0], cube=curves[1])
+            path = self._exposed(measured, known.exposure_s)
+            if not known.bend.any():  # a straight path was preferred
+                path = replace(path, bend=known.bend, cube=known.cube)
+            path = replace(path, pose=known.pose, blur=known.blur, skew=known.skew)
             found.append(self._corrected(measured, path))
         if self._frame.draws == 0 or self._terms.curve:
             times = EXPOSURES * measured.frame_s
-            fits = measured_fits(self._pair, [measured.exposed(time, camera, depth) for time in times])
+            fits = measured_fits(self._pair, [self._exposed(measured, float(time)) for time in times])
             found += [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.misfit).motion)]
         return found
 
+    def _exposed(self, measured: MeasuredPath, seconds: float) -> FrameMotion:
+        return measured.exposed(seconds, self._shot.camera, finest_level(self._pair).median)
+
     def _corrected(self, measured: MeasuredPath, path: FrameMotion) -> MotionFit:
-        camera = self._shot.camera
-        precision = measured.blur_precision(path.exposure_s, camera, path.median_depth)
-        blur = measured.exposed(path.exposure_s, camera, path.median_depth).blur
-        return corrected(self._pair, path, blur, precision, pose=self._terms.pose)
+        known = measured.measurement(path.exposure_s, self._shot.camera, path.median_depth)
+        return corrected(self._pair, path, known, pose=self._terms.pose)
 
     def accepted(self, best: MotionFit, still: MotionFit) -> MotionFit:
         """Return ``best`` if it explains enough more than ``still``, else ``still``.
 
         The model that the frame had needs only half as much, and so does a measured motion.
         """
+        if best.model == still.model:
+            return min(best, still, key=lambda fit: fit.misfit)
         known = best.model == self._frame.model or best.motion.exposure_s > 0.0
         gain = explained_share(best.misfit, still.misfit)
         return best if gain >= self._config.accept * (0.5 if known else 1.0) else still

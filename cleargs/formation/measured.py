@@ -10,6 +10,7 @@ import numpy as np
 
 from cleargs.capture.measuring import MOTION
 from cleargs.formation.motion import TWIST, FrameMotion
+from cleargs.formation.search import Measurement
 from cleargs.parquet import read_table
 from cleargs.splat.camera import Camera
 from cleargs.types import ArrayF64
@@ -38,8 +39,12 @@ class MeasuredPath:
     def read(self, camera: Camera, depth: float | None = None) -> FrameMotion:
         """Return the motion during the readout alone, px of ``camera``. ``depth`` is the median depth."""
         scales = self._scales(camera, depth)
-        skew = self.readout_s * self.path[0] * scales
-        return FrameMotion(skew=skew, columns=self.columns, median_depth=depth or self.depth)
+        return FrameMotion(
+            skew=self.readout_s * self.path[0] * scales,
+            skew_bend=0.5 * self.readout_s**2 * self.path[1] * scales,
+            columns=self.columns,
+            median_depth=depth or self.depth,
+        )
 
     def exposed(self, seconds: float, camera: Camera, depth: float | None = None) -> FrameMotion:
         """Return the motion during the readout and an exposure of ``seconds``, px of ``camera``."""
@@ -57,11 +62,13 @@ class MeasuredPath:
             exposure_s=seconds,
         )
 
-    def blur_precision(self, seconds: float, camera: Camera, depth: float) -> ArrayF64:  # [6, 6] per px^2
-        """Return the inverse covariance of the blur of an exposure."""
-        scales = seconds * self._scales(camera, depth)
+    def measurement(self, seconds: float, camera: Camera, depth: float) -> Measurement:
+        """Return the speed in px per frame of the video, for an exposure of ``seconds``."""
+        scales = self.frame_s * self._scales(camera, depth)
         covariance = self.covariance * np.outer(scales, scales)
-        return np.linalg.inv(covariance + 1e-6 * np.trace(covariance) / TWIST * np.eye(TWIST))
+        precision = np.linalg.inv(covariance + 1e-6 * np.trace(covariance) / TWIST * np.eye(TWIST))
+        exposure, readout = seconds / self.frame_s, self.readout_s / self.frame_s
+        return Measurement(self.path[0] * scales, precision, exposure, readout)
 
     def _scales(self, camera: Camera, depth: float | None) -> ArrayF64:  # [6]
         """Return px per world unit and per radian."""
@@ -69,7 +76,13 @@ class MeasuredPath:
 
 
 def load_paths(ingest: Path) -> dict[int, MeasuredPath]:
-    """Return the measured paths of the frames in the folder ``ingest``, by frame_id. Raises StoreError."""
+    """Return the measured paths of the frames in the folder ``ingest``, by frame_id.
+
+    A folder of an older version has none. Raises StoreError if the table is damaged.
+    """
+    table = ingest / "motion.parquet"
+    if not table.is_file():
+        return {}
     return {
         row["frame_id"]: MeasuredPath(
             np.array(row["path"]).reshape(-1, TWIST),
@@ -79,6 +92,6 @@ def load_paths(ingest: Path) -> dict[int, MeasuredPath]:
             row["readout_s"] or 0.0,
             row["readout_columns"],
         )
-        for row in read_table(ingest / "motion.parquet", MOTION).to_pylist()
+        for row in read_table(table, MOTION).to_pylist()
         if row["path"] is not None
     }

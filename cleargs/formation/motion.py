@@ -13,10 +13,10 @@ from cleargs.types import ArrayF32, ArrayF64
 TWIST = 6
 """Number of values of a twist: translation along x, y, z, then rotation about x, y, z, in camera axes."""
 
-TWISTS = ("pose", "blur", "skew", "bend", "cube")
+TWISTS = ("pose", "blur", "skew", "bend", "cube", "skew_bend")
 """Names of a motion's twists, in the order of its numbers."""
 
-POSE, BLUR, SKEW, BEND, CUBE = (slice(k * TWIST, (k + 1) * TWIST) for k in range(len(TWISTS)))
+POSE, BLUR, SKEW, BEND, CUBE, _ = (slice(k * TWIST, (k + 1) * TWIST) for k in range(len(TWISTS)))
 """Places of the twists in `FrameMotion.vector`."""
 
 Model: TypeAlias = Literal["none", "blur", "skew", "both", "defocus"]
@@ -45,6 +45,8 @@ class FrameMotion:
     """Motion from the start to the end of a row's exposure: the part of the path that is linear in time."""
     skew: ArrayF64 = field(default_factory=_still)
     """Motion from the first to the last row's exposure (rolling shutter); 0 at the middle row."""
+    skew_bend: ArrayF64 = field(default_factory=_still)
+    """Second order of a measured skew: times s^2 at s of the readout, -1/2 to 1/2."""
     columns: bool = False
     """True if the columns are read one after the other: ``skew`` is from the first to the last column."""
     pose: ArrayF64 = field(default_factory=_still)
@@ -61,13 +63,13 @@ class FrameMotion:
 
     @property
     def vector(self) -> ArrayF64:
-        """Pose, blur, skew, bend and cube, [30]."""
+        """The twists in the order of `TWISTS`, [36]."""
         return np.concatenate([getattr(self, name) for name in TWISTS])
 
     def with_vector(self, vector: ArrayF64) -> FrameMotion:
-        """Return this motion with the twists in ``vector`` [30], in the order of `vector`."""
-        pose, blur, skew, bend, cube = vector.reshape(len(TWISTS), TWIST)
-        return replace(self, pose=pose, blur=blur, skew=skew, bend=bend, cube=cube)
+        """Return this motion with the twists in ``vector`` [36], in the order of `vector`."""
+        pose, blur, skew, bend, cube, skew_bend = vector.reshape(len(TWISTS), TWIST)
+        return replace(self, pose=pose, blur=blur, skew=skew, bend=bend, cube=cube, skew_bend=skew_bend)
 
     @property
     def order(self) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,27 +127,39 @@ def measured_fits(pair: FramePair, motions: Sequence[FrameMotion]) -> list[Motio
     return [level.evaluate(named("blur", path), path) for path in paths]
 
 
-def corrected(
-    pair: FramePair,
-    motion: FrameMotion,
-    measured: ArrayF64,  # [6] blur, px
-    precision: ArrayF64,  # [6, 6] inverse of its covariance, per px^2
-    *,
-    pose: bool,
-) -> MotionFit:
-    """Correct the blur of ``motion``, held by its measurement, and with ``pose`` the pose.
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Measured speed of a camera, as blur and skew of a frame: both are the same twist times a duration."""
 
-    Skew and curves stay.
+    speed: ArrayF64  # [6] px per frame of the video
+    precision: ArrayF64  # [6, 6] inverse of its covariance
+    exposure: float
+    """Exposure time, in frames of the video."""
+    readout: float
+    """Readout time, likewise."""
+
+
+def corrected(pair: FramePair, motion: FrameMotion, measured: Measurement, *, pose: bool) -> MotionFit:
+    """Correct the speed behind blur and skew of ``motion``, held by its measurement; with ``pose``, the pose.
+
+    Curves stay.
     """
     level = finest_level(pair)
-    parts = [POSE, BLUR] if pose else [BLUR]
+    parts = [POSE, BLUR, SKEW]
     active = np.concatenate([np.arange(len(TWISTS) * TWIST)[part] for part in parts])
+    times = np.repeat([0.0, measured.exposure, measured.readout], TWIST)
+    to_speed = times[:, None] * np.tile(np.eye(TWIST), (len(parts), 1))
+    unknowns = np.hstack([np.eye(len(active))[:, :TWIST], to_speed]) if pose else to_speed
+    total = measured.exposure**2 + measured.readout**2
+    speed = (measured.exposure * motion.blur + measured.readout * motion.skew) / total
     variance = (1.25 * level.evaluate("blur", motion).misfit) ** 2  # of normal errors with this mean
-    matrix = np.zeros((len(active), len(active)))
-    matrix[-TWIST:, -TWIST:] = SHARED_PIXELS * variance * precision
-    middle = np.concatenate([motion.pose, measured]) if pose else measured
-    found = _descend(level, motion, active, WARM_STEPS, prior=(middle, matrix))
-    return level.evaluate(named("blur", found), found)
+    held = np.zeros((unknowns.shape[1], unknowns.shape[1]))
+    held[-TWIST:, -TWIST:] = SHARED_PIXELS * variance * measured.precision
+    before = np.concatenate([np.zeros(unknowns.shape[1] - TWIST), speed - measured.speed])
+    found = _descend(level, motion, active, WARM_STEPS, unknowns, prior=(before, held))
+    if not motion.blur.any():
+        found = replace(found, blur=motion.blur)
+    return level.evaluate(named("blur" if found.blur.any() else "none", found), found)
 
 
 def refine(
@@ -292,15 +304,17 @@ def _descend(
     """Run Levenberg-Marquardt over the ``active`` numbers from ``motion``.
 
     ``unknowns`` [A, U] are the combinations of the active numbers that may change; None: all of them.
-    ``prior`` has the expected active numbers [A] and the matrix [A, A] that holds them there.
+    ``prior`` has the present distances [U] of these combinations from their expected values, and the matrix
+    [U, U] that holds them there.
     """
     vector, cost, damping = motion.vector, level.cost(motion), DAMPING
+    moved = np.zeros(len(active) if unknowns is None else unknowns.shape[1])
     for _ in range(steps):
         matrix, side = level.normal_equations(motion, active)
-        if prior is not None:
-            matrix, side = matrix + prior[1], side + prior[1] @ (prior[0] - vector[active])
         if unknowns is not None:
             matrix, side = unknowns.T @ matrix @ unknowns, unknowns.T @ side
+        if prior is not None:
+            matrix, side = matrix + prior[1], side - prior[1] @ (prior[0] + moved)
         diagonal = matrix.diagonal()
         if diagonal.max() <= 0.0:
             break  # the image determines none of the numbers
@@ -315,7 +329,7 @@ def _descend(
             damping *= MORE_DAMPING
         else:
             break
-        gain, vector, motion, cost = cost - after, trial, tried, after
+        gain, vector, motion, cost, moved = cost - after, trial, tried, after, moved + change
         if gain < CONVERGED * cost:
             break
         damping = max(damping / 4.0, 1e-4)

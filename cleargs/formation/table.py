@@ -16,6 +16,7 @@ _TWISTS = {
     "pose": " from the pose as given to the mean pose of the exposure",
     "blur": " from the start to the end of a row's exposure, linear in time",
     "skew": " from the first to the last row's exposure",
+    "skew_bend": ", times s^2 at s of the readout, -1/2 to 1/2",
     "bend": ", times t^2 - 1/12 at time t of the exposure, -1/2 to 1/2",
     "cube": ", times t^3 - 3t/20 at time t of the exposure, -1/2 to 1/2",
 }
@@ -23,7 +24,7 @@ _TWISTS = {
 
 def _component(name: str, axis: str) -> pa.Field:
     text = f"{axis} of the scene past the camera{_TWISTS[name]}, px: t times fx / median depth, r times fx"
-    return column(f"{name}_{axis}", pa.float64(), text, nullable=name in ("bend", "cube"))
+    return column(f"{name}_{axis}", pa.float64(), text, nullable=name in ("bend", "cube", "skew_bend"))
 
 
 FORMATION = pa.schema(

@@ -104,7 +104,8 @@ def displacement_fields(
     numbers[layout.MEDIAN] = motion.median_depth
     numbers[[layout.DISC, layout.FOCUS]] = scale * motion.disc_px, motion.focus
     numbers[[layout.READ_ACROSS, layout.READ_DOWN]] = motion.columns, not motion.columns
-    numbers[layout.TWISTS :] = scale * motion.vector
+    twists = motion.pose, motion.blur, motion.skew, motion.skew_bend, motion.bend, motion.cube
+    numbers[layout.TWISTS :] = scale * np.concatenate(twists)
     return backend_for(depth.device).displacements(depth, alpha, torch.from_numpy(numbers), margin=margin)
 
 

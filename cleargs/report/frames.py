@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from cleargs.capture.measuring import MOTION
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
@@ -70,6 +71,8 @@ class FrameRow:
     used the frame."""
     moving: MaskBool | None = None  # [rows, columns]
     """True for the cells of an even grid that the training ignored, because something moves there."""
+    speed_px: float | None = None
+    """Measured speed of the scene in the image, px per frame of the video; None if none was measured."""
 
     @property
     def role(self) -> str:
@@ -200,6 +203,11 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
             affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
         if (path := run / final / "formation.parquet").is_file():
             formation = {row.pop("frame_id"): row for row in read_any_table(path).to_pylist()}
+    speeds: dict[int, float] = {}
+    if (path := run / "ingest" / "motion.parquet").is_file():
+        for row in read_table(path, MOTION).to_pylist():
+            if row["speed_px"] is not None:
+                speeds[row["frame_id"]] = row["speed_px"] * row["frame_s"]
     return [
         FrameRow(
             frame,
@@ -209,6 +217,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
             formation.get(frame.frame_id, {}),
             psnr.get(frame.frame_id),
             moving.get(frame.frame_id),
+            speeds.get(frame.frame_id),
         )
         for frame in load_frames(run / "ingest")
     ]

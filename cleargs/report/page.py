@@ -194,6 +194,7 @@ def frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> di
         "rolling shutter, px": row.motion("skew_px"),
         "defocus, px": row.formation.get("defocus_px"),
         "exposure, stops": row.gain_ev,
+        "camera speed, px per video frame": row.speed_px,
     }
     return {
         "id": row.frame.frame_id,

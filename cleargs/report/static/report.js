@@ -104,6 +104,7 @@ const describe = (frame) => {
 {
   const LANES = [
     { title: "Weight in training", of: (frame) => frame.weight, low: 0, high: 1, unit: "" },
+    { title: "Camera speed", of: (frame) => frame.found["camera speed, px per video frame"], low: 0, unit: " px per video frame" },
     { title: "Motion blur", of: (frame) => frame.found["blur, px"], low: 0, unit: " px" },
     { title: "PSNR per frame", of: (frame) => frame.psnr, unit: " dB", tall: true, worst: true },
     { title: "Rolling shutter", of: (frame) => frame.found["rolling shutter, px"], low: 0, unit: " px", only: 1 },

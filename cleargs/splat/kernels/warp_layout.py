@@ -30,9 +30,9 @@ DISC = 5  # radius of the defocus disc per unit of nearness
 FOCUS = 6  # nearness that is in focus
 READ_ACROSS = 7  # 1 if columns are read one after the other, else 0
 READ_DOWN = 8  # 1 if rows are
-TWISTS = 9  # pose, blur, skew, bend and cube: translation and rotation, six numbers each
-CURVES = 27  # first number of bend; bend and cube are zero on a straight path
-MOTION_COLUMNS = 39
+TWISTS = 9  # pose, blur, skew, skew_bend, bend and cube: translation and rotation, six numbers each
+CURVES = 33  # first number of bend; bend and cube are zero on a straight path
+MOTION_COLUMNS = 45
 
 BEND_REACH = 1.0 / 6.0
 CUBE_REACH = 1.0 / 20.0

@@ -176,7 +176,7 @@ def displacements(
     depth: ArrayF32,  # [H + 2 margin, W + 2 margin] accumulated
     alpha: ArrayF32,  # [H + 2 margin, W + 2 margin]
     margin: int,
-    motion: ArrayF32,  # [39]: see `warp_layout`
+    motion: ArrayF32,  # [45]: see `warp_layout`
     offset: ArrayF32,  # [2, H, W] written
     sweep: ArrayF32,  # [2, H, W] written
     radius: ArrayF32,  # [H, W] written
@@ -191,7 +191,7 @@ def displacements(
     """
     _, height, width = offset.shape
     fx, fy, cx, cy = motion[layout.FX], motion[layout.FY], motion[layout.CX], motion[layout.CY]
-    twists = motion[layout.TWISTS :].reshape(5, 6)
+    twists = motion[layout.TWISTS :].reshape(6, 6)
     for row in prange(height):
         down = motion[layout.READ_DOWN] * np.float32((row + 0.5) / height - 0.5)
         y = (np.float32(row) + np.float32(0.5) - cy) / fy
@@ -208,8 +208,13 @@ def displacements(
                 tx, ty, tz, rx, ry, rz = _twist(twists, part)
                 if part == 0:
                     read = down + motion[layout.READ_ACROSS] * np.float32((column + 0.5) / width - 0.5)
-                    tx, ty, tz = tx + read * twists[2, 0], ty + read * twists[2, 1], tz + read * twists[2, 2]
-                    rx, ry, rz = rx + read * twists[2, 3], ry + read * twists[2, 4], rz + read * twists[2, 5]
+                    again = read * read
+                    tx += read * twists[2, 0] + again * twists[3, 0]
+                    ty += read * twists[2, 1] + again * twists[3, 1]
+                    tz += read * twists[2, 2] + again * twists[3, 2]
+                    rx += read * twists[2, 3] + again * twists[3, 3]
+                    ry += read * twists[2, 4] + again * twists[3, 4]
+                    rz += read * twists[2, 5] + again * twists[3, 5]
                 field = offset if part == 0 else sweep
                 along_x, along_y = _flow(x, y, near, (tx, ty, tz, rx, ry, rz))
                 field[0, row, column] = along_x
@@ -218,7 +223,7 @@ def displacements(
             vertical = abs(offset[1, row, column]) + np.float32(0.5) * abs(sweep[1, row, column])
             if curve is not None:
                 for part in range(2):
-                    along_x, along_y = _flow(x, y, near, _twist(twists, 3 + part))
+                    along_x, along_y = _flow(x, y, near, _twist(twists, 4 + part))
                     curve[2 * part, row, column] = along_x
                     curve[2 * part + 1, row, column] = along_y * (fy / fx)
                 vertical += _curved_reach(curve[1, row, column], curve[3, row, column])

@@ -28,7 +28,7 @@ LEAST_LIGHT = 1e-18
 
 @triton.jit
 def twist_of(motion, part):
-    """Return a twist of a frame's motion, by its number in ``cleargs.formation.motion.TWISTS``."""
+    """Return a twist of a frame's motion, by its number in ``warp_layout``."""
     first = motion + layout.TWISTS + 6 * part
     tx, ty, tz = tl.load(first), tl.load(first + 1), tl.load(first + 2)
     return tx, ty, tz, tl.load(first + 3), tl.load(first + 4), tl.load(first + 5)
@@ -81,6 +81,8 @@ def displace(
     # Pose and skew give the offset, blur gives the sweep.
     pose_x, pose_y = flow(x, y, near, twist_of(motion, 0))
     skew_x, skew_y = flow(x, y, near, twist_of(motion, 2))
+    bend_x, bend_y = flow(x, y, near, twist_of(motion, 3))
+    skew_x, skew_y = skew_x + read * bend_x, skew_y + read * bend_y
     tl.store(offset + pixel, pose_x + read * skew_x, mask=inside)
     tl.store(offset + plane + pixel, (pose_y + read * skew_y) * (fy / fx), mask=inside)
     blur_x, blur_y = flow(x, y, near, twist_of(motion, 1))
@@ -88,7 +90,7 @@ def displace(
     tl.store(sweep + plane + pixel, blur_y * (fy / fx), mask=inside)
     if CURVED:
         for part in tl.static_range(2):
-            along_x, along_y = flow(x, y, near, twist_of(motion, 3 + part))
+            along_x, along_y = flow(x, y, near, twist_of(motion, 4 + part))
             tl.store(curve + 2 * part * plane + pixel, along_x, mask=inside)
             tl.store(curve + (2 * part + 1) * plane + pixel, along_y * (fy / fx), mask=inside)
     disc = tl.load(motion + layout.DISC) * tl.abs(near - tl.load(motion + layout.FOCUS))
@@ -265,7 +267,7 @@ def follow_curve(image, curve, out, slope, pixels, FROM: tl.constexpr, TO: tl.co
 
 @memory_errors()
 def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) -> DisplacementFields:
-    """See ``cleargs.formation.warp.displacement_fields``. ``motion`` [39] is on the CPU."""
+    """See ``cleargs.formation.warp.displacement_fields``. ``motion`` [45] is on the CPU."""
     height, width = (side - 2 * margin for side in depth.shape)
     offset, sweep = depth.new_empty(2, height, width), depth.new_empty(2, height, width)
     radius = depth.new_empty(height, width)
