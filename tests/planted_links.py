@@ -14,7 +14,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from io import StringIO
 from itertools import islice
@@ -44,7 +44,7 @@ NEW_EACH_TIME = re.compile(r"\.partial\.|\.rubbish-|\.link-[0-9a-f]{8}|\.carried
 
 @dataclass
 class Trace:
-    """Audit hook that notes every path below ``root`` that this process uses, and every one in ``outside``."""
+    """Audit hook that notes every path below ``root`` that is used, and every use of ``outside``."""
 
     root: Path
     outside: Path
@@ -64,10 +64,8 @@ class Trace:
             self.on = True
 
     def _note(self, event: str, path: str, arguments: tuple[Any, ...]) -> None:
-        bases = [""]
-        if not os.path.isabs(path):  # relative to one of the open folders
-            bases = [os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if _is_open(fd)]
-        for base in bases:
+        # A relative path may start from any of the open folders.
+        for base in [Path("/")] if Path(path).is_absolute() else open_folders():
             place = Path(base, path)
             if self.root in place.parents:
                 self.used.add(place.relative_to(self.root))
@@ -78,11 +76,13 @@ class Trace:
                 self.touched.add(f"{event} {place}")
 
 
-def _is_open(descriptor: str) -> bool:
-    try:
-        return os.readlink(f"/proc/self/fd/{descriptor}").startswith("/")
-    except OSError:
-        return False
+def open_folders() -> list[Path]:
+    """Return the paths of all open files and folders of this process."""
+    found = []
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # the descriptor of this listing
+            found.append(descriptor.readlink())
+    return [path for path in found if path.is_absolute()]
 
 
 @dataclass
@@ -155,7 +155,7 @@ class Planter:
         return sorted(path for path in found if path.parts and not NEW_EACH_TIME.search(f"/{path}"))
 
     def plant(self, path: Path, kind: str) -> bool:
-        """Put a link in the place of ``path``, to a copy of what is there. Return False if that is impossible."""
+        """Put a link to a copy in the place of ``path``. Return False if that is impossible."""
         self.restore()
         place, goal = self.bench.folder / path, self.trace.outside / "goal"
         try:
@@ -211,15 +211,15 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes | str]]:
     """Name -> modification time and content, of everything below ``folder``."""
     found: dict[str, tuple[int, bytes | str]] = {}
     for path in (folder, *sorted(folder.rglob("*"))):
-        content = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else ""
+        content = str(path.readlink()) if path.is_symlink() else path.read_bytes() if path.is_file() else ""
         found[str(path)] = (path.lstat().st_mtime_ns, content)
     return found
 
 
-def planted(root: Path, kinds: Sequence[str] = KINDS) -> Iterator[tuple[Path, str]]:
-    """Check links of all ``kinds`` at all paths, and yield each path and kind."""
+def planted(root: Path, kinds: Sequence[str] = KINDS, depth: int = 99) -> Iterator[tuple[Path, str]]:
+    """Check links of all ``kinds`` at all paths of at most ``depth`` parts, and yield each path and kind."""
     planter = Planter(root)
-    for path in planter.paths():
+    for path in (path for path in planter.paths() if len(path.parts) <= depth):
         for kind in kinds:
             if planter.check(path, kind):
                 yield path, kind

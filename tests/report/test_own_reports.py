@@ -7,12 +7,15 @@ import os
 import zipfile
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from report_run import FinishedRun
 from watched import reported, serving
 
+from cleargs.capture.tables import FRAMES, load_frames
 from cleargs.cli.main import invoke
 from cleargs.errors import StoreError
+from cleargs.parquet import read_table, write_table
 from cleargs.report.report_json import require_own
 
 
@@ -84,3 +87,13 @@ def test_links_in_a_report_are_neither_packed_nor_served(finished: FinishedRun, 
             link.unlink()
         links[-1].write_bytes(page)
         (run / "eval").rmdir()
+
+
+def test_a_table_may_not_name_images_outside(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    table = run.folder / "ingest" / "frames.parquet"
+    rows = read_table(table, FRAMES).to_pylist()
+    rows[0]["image"] = "../../secret.png"
+    write_table(table, pa.Table.from_pylist(rows, FRAMES), FRAMES)
+    with pytest.raises(StoreError, match="outside"):
+        load_frames(run.folder / "ingest")
