@@ -72,8 +72,8 @@ class DigestMemo:
 
     Any program can set mtime. Only the kernel sets ctime: at every write, and also when mtime is set back. If
     the file is damaged or not writable, digests are computed again, and no error is raised. It is read at the
-    start and replaced at the end, if its folder exists by then. What another process added in between may be
-    lost.
+    start and replaced at the end, if its folder exists by then. Rows that another process added in between
+    may be lost.
     """
 
     def __init__(self, path: Path) -> None:

@@ -152,7 +152,7 @@ def has_results(run: Path, stage: str) -> bool:
     """Return True if ``RUN/<stage>`` is a folder of files, or a link to one that the store made.
 
     Such a link leads to ``<stage>/<key>``, and no folder of the store or of the run on its way is a link.
-    Results with a link, FIFO or device in them are not results of ours.
+    A folder with a link, FIFO or device in it has no results.
     """
     folder = run / stage
     if folder.is_symlink():

@@ -1,6 +1,6 @@
 """Files of a run folder or a store, which are opened and listed without following links.
 
-Somebody else may have sent the folder. A link in it could lead to any file of the user. The folder itself may
+Another person may have sent the folder. A link in it could lead to any file of the user. The folder itself may
 be a link, because the user named it.
 """
 
@@ -95,7 +95,7 @@ def refuse_links(paths: Iterable[Path]) -> None:
 def leftovers(folder: Path, name: str = "*") -> list[Path]:
     """Return the partial folders in ``folder`` of processes that died while they wrote ``name``.
 
-    Where the file system has no locks, none is returned.
+    If the file system has no locks, none is returned.
     """
     found = folder.glob(f".{'[0-9a-f]' * 8}{PARTIAL_SUFFIX}.{name}")
     return [path for path in sorted(found) if path.is_dir() and not path.is_symlink() and is_free(path)]

@@ -36,7 +36,10 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
     ("gc", "RUN", "--checkpoints", "--yes"),
 )
 
-KINDS = ("link", "relative link", "dangling link", "hard link", "link to the run", "FIFO")
+KINDS = (
+    *("link", "relative link", "dangling link", "hard link", "link to the run", "FIFO"),
+    *("link to a link", "link to the parent"),
+)
 
 NEW_EACH_TIME = re.compile(r"\.partial\.|\.rubbish-|\.link-[0-9a-f]{8}|\.carried|/dev/|\.at_work")
 """Names that nobody can foresee, or that are tested by themselves."""
@@ -71,7 +74,12 @@ class Trace:
                 self.used.add(place.relative_to(self.root))
             flags = arguments[2] if event == "open" and len(arguments) > 2 else 0
             follows = event != "open" or not (isinstance(flags, int) and flags & os.O_NOFOLLOW)
-            removes = event in ("os.remove", "os.rename", "os.symlink", "os.link")  # of the link itself
+            removes = event in (
+                "os.remove",
+                "os.rename",
+                "os.symlink",
+                "os.link",
+            )  # they act on the link itself
             if follows and not removes and self.outside in Path(os.path.realpath(place)).parents:
                 self.touched.add(f"{event} {place}")
 
@@ -188,7 +196,10 @@ class Planter:
                 "relative link": Path(os.path.relpath(goal, place.parent)),
                 "dangling link": self.trace.outside / "new",
                 "link to the run": self.bench.folder,
+                "link to a link": self.trace.outside / "another",
+                "link to the parent": Path(".."),
             }
+            (self.trace.outside / "another").symlink_to(goal)
             place.symlink_to(targets[kind])
         return True
 

@@ -147,7 +147,7 @@ class Batch:
         names, summary = visible_names(self.folder), self.folder / SUMMARY
         refuse_links(self.folder / part for part in ("scenes", "store", "exports", "logs", "report", SUMMARY))
         refuse_links(place for scene in self.scenes for place in (self.run_folder(scene), self.log(scene)))
-        marks = ("plan.json", f"scenes/*/{RUN_FILE}")  # of the Snakefile, and of a scene
+        marks = ("plan.json", f"scenes/*/{RUN_FILE}")  # the Snakefile makes the first, a scene the second
         known = is_store(self.store) or any(any(self.folder.glob(mark)) for mark in marks)
         if summary.is_file():
             known = read_bytes(summary, root=self.folder).startswith(_HEADER)

@@ -355,7 +355,7 @@ class Garbage:
 def check_store(root: Path) -> None:
     """Check that ``root`` is a store, or that one may be made there.
 
-    Raises InputError if it has content and is no store, and StoreError if a link or a device is in it.
+    Raises InputError if it has content and is not a store, and StoreError if a link or a device is in it.
     """
     if root.name == STORE_FOLDER:
         refuse_links([root])
