@@ -1,7 +1,7 @@
 """Files of a run folder or a store, which are opened and listed without following links.
 
-Another person may have sent the folder. A link in it could lead to any file of the user. The folder itself may
-be a link, because the user named it.
+Another person may have sent the folder. A link in it could lead to any file of the user. The folder itself
+may be a link, because the user named it.
 """
 
 from __future__ import annotations
