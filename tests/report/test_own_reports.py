@@ -97,3 +97,19 @@ def test_a_table_may_not_name_images_outside(tmp_path: Path) -> None:
     write_table(table, pa.Table.from_pylist(rows, FRAMES), FRAMES)
     with pytest.raises(StoreError, match="outside"):
         load_frames(run.folder / "ingest")
+
+
+@pytest.mark.parametrize("name", ["eval", "eval/room"])
+def test_eval_writes_through_no_link(
+    name: str, finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = finished.folder / name
+    place.parent.mkdir(exist_ok=True)
+    place.symlink_to(tmp_path)
+    try:
+        assert invoke(["eval", str(finished.folder), "--reference", str(tmp_path)]) == 1
+        assert f"{place} is a link" in capsys.readouterr().err
+    finally:
+        place.unlink()
+        if place.parent != finished.folder:
+            place.parent.rmdir()
