@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import sqlite3
 import time
 from collections.abc import Mapping
-from contextlib import closing, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cleargs.errors import InputError
-from cleargs.files import External
-from cleargs.safe_io import open_regular, require_utf8
+from cleargs.errors import InputError, StoreError
+from cleargs.files import External, write_bytes
+from cleargs.safe_io import FAULTS, open_regular, read_json, require_utf8
 
 RACY_NS = 2_000_000_000
 """Nanoseconds. A file that changed less than this ago is not memoised: it may change again within one tick of
 its time stamp, which is up to 2 s (FAT)."""
 
-COLUMNS = "size, mtime_ns, ctime_ns, inode, digest"
-"""Columns of the memo's table, after the path."""
+MAX_ROWS = 500_000
+"""Maximum number of files in the memo. Those that were read last are kept."""
 
 _Row: TypeAlias = tuple[int, int, int, int, str]
 
@@ -47,33 +45,41 @@ def tree_digest(files: Mapping[str, str]) -> str:
 
 
 def files_under(path: Path) -> dict[str, Path]:
-    """Return relative POSIX path -> file, for all files below the folder ``path`` that are not hidden."""
-    found = {}
-    for folder, folders, names in os.walk(path, followlinks=True):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in sorted(names):
-            if not name.startswith("."):
-                file = Path(folder, name)
-                found[file.relative_to(path).as_posix()] = file
+    """Return relative POSIX path -> file, for all files below the folder ``path`` that are not hidden.
+
+    Each folder is entered once, by its own name if it also has links: links may form loops.
+    """
+    found, entered, folders, links = {}, set(), [path], list[Path]()
+    while folders or links:
+        folder = folders.pop() if folders else links.pop()
+        with suppress(OSError):  # a folder that may not be read has no files
+            status = folder.stat()
+            if (status.st_dev, status.st_ino) in entered:
+                continue
+            entered.add((status.st_dev, status.st_ino))
+            for place in sorted(folder.iterdir(), reverse=True):
+                if place.name.startswith("."):
+                    continue
+                if place.is_dir():
+                    (links if place.is_symlink() else folders).append(place)
+                else:
+                    found[place.relative_to(path).as_posix()] = place
     return found
 
 
 class DigestMemo:
-    """A cache of digests by path, size, inode, mtime and ctime, stored in an SQLite file.
+    """A cache of digests by path, size, inode, mtime and ctime, stored in a JSON file.
 
     Any program can set mtime. Only the kernel sets ctime: at every write, and also when mtime is set back. If
-    the SQLite file is damaged, locked or not writable, digests are computed again, and no error is raised.
-    The file is read at the start and written at the end, if its folder exists by then.
+    the file is damaged or not writable, digests are computed again, and no error is raised. It is read at the
+    start and replaced at the end, if its folder exists by then. Rows that another process added in between
+    may be lost.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._known: dict[str, _Row] = {}
+        self._known = self._read()
         self._learnt: dict[str, _Row] = {}
-        if path.exists():
-            with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=5)) as database:
-                rows = database.execute(f"SELECT path, {COLUMNS} FROM contents")
-                self._known = {row[0]: row[1:] for row in rows}
 
     def __enter__(self) -> DigestMemo:
         return self
@@ -81,14 +87,10 @@ class DigestMemo:
     def __exit__(self, *raised: object) -> None:
         if not self._learnt or not self._path.parent.is_dir():
             return
-        try:
-            self._write()
-        except sqlite3.OperationalError:
-            pass  # locked, or not writable: the next run hashes again
-        except sqlite3.DatabaseError:  # damaged: start a new file
-            with suppress(OSError, sqlite3.Error):
-                self._path.unlink(missing_ok=True)
-                self._write()
+        rows = [*(self._read() | self._learnt).items()][-MAX_ROWS:]
+        with suppress(StoreError):  # not writable: the next run hashes again
+            text = json.dumps({name: row for name, row in rows if row != NOTHING}, separators=(",", ":"))
+            write_bytes(self._path, text.encode())
 
     def digest(self, path: Path) -> str:
         """Return the digest of the file at ``path``, from the memo if size, times and inode are unchanged."""
@@ -129,11 +131,12 @@ class DigestMemo:
                 hint="check the path and its permissions, or remove it from the input",
             ) from error
 
-    def _write(self) -> None:
-        rows = [(name, *row) for name, row in self._learnt.items()]
-        with closing(sqlite3.connect(self._path, timeout=5)) as database, database:
-            database.execute(f"CREATE TABLE IF NOT EXISTS contents (path TEXT PRIMARY KEY, {COLUMNS})")
-            database.executemany("INSERT OR REPLACE INTO contents VALUES (?, ?, ?, ?, ?, ?)", rows)
+    def _read(self) -> dict[str, _Row]:
+        """Return path -> row of the files that were read before; nothing if the file cannot be used."""
+        with suppress(*FAULTS):
+            rows = read_json(self._path, root=self._path.parent).items()
+            return {name: (size, m, c, inode, digest) for name, (size, m, c, inode, digest) in rows}
+        return {}
 
 
 def named_files(external: External) -> dict[str, Path]:

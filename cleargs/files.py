@@ -7,8 +7,9 @@ import json
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -51,13 +52,53 @@ def whole_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     try:
         with disk_errors(path):
             folder.mkdir()
-            yield folder
-            if replace and path.exists():
-                path.rename(old)
-            folder.rename(path)
+            with _locked(folder):
+                yield folder
+                if replace and path.exists():
+                    path.rename(old)
+                folder.rename(path)
             shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[bool | None]:
+    """Hold the lock of a folder. Yields the result of `acquire_lock`."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        yield acquire_lock(handle, shared=False, wait=False)
+    finally:
+        os.close(handle)
+
+
+def is_free(partial: Path) -> bool:
+    """Return True if the process that wrote a folder of `whole_folder` has died.
+
+    A living process holds its lock. It needs less than a second to get it.
+    """
+    with suppress(OSError), _locked(partial) as locked:
+        return locked is True and time.time() - partial.stat().st_mtime > 1.0
+    return False
+
+
+def acquire_lock(handle: int, *, shared: bool, wait: bool) -> bool | None:
+    """Lock an open file or folder until it is closed. Return False if another process holds a lock.
+
+    None means that the file system, or this Python, has no locks.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    try:
+        fcntl.flock(handle, kind if wait else kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
 
 
 def is_partial(path: Path) -> bool:
@@ -118,9 +159,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 def disk_error(error: OSError, path: Path) -> StoreError:
     """Return the StoreError, with a hint, for a failed write of ``path``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return StoreError(
-            f"no space left on the disk of {path.parent}", hint="free some space, or choose another --store"
-        )
+        return no_space(path.parent)
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return StoreError(
             f"cannot write to {path.parent}: {error.strerror}", hint="choose a folder that you may write to"
@@ -130,3 +169,13 @@ def disk_error(error: OSError, path: Path) -> StoreError:
         f"cannot write {path}: {error.strerror or error}",
         hint="choose a shorter path" if too_long else "check the disk and its permissions",
     )
+
+
+def no_space(folder: Path) -> StoreError:
+    """Return the StoreError for a full disk, where space or file numbers (inodes) are used up."""
+    what, remedy = "space", "free some space (cleargs gc)"
+    with suppress(OSError):
+        disk = os.statvfs(next(place for place in (folder, *folder.parents) if place.exists()))
+        if disk.f_files and not disk.f_favail and disk.f_bavail:
+            what, remedy = "room for more files (inodes)", "delete some files (cleargs gc)"
+    return StoreError(f"no {what} left on the disk of {folder}", hint=f"{remedy}, or choose another --store")

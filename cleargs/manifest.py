@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -13,10 +14,13 @@ import cleargs
 from cleargs.base_model import FrozenModel
 from cleargs.digest import DigestMemo, json_digest
 from cleargs.files import is_partial, write_json
+from cleargs.own_files import has_only_files, regular_files
 from cleargs.safe_io import FAULTS, read_json
 
 MANIFEST = "manifest.json"
 
+_BEFORE = ".before"
+"""Ending of the hidden links of a run."""
 
 SCHEMA = 1
 """Incremented when the computation of keys changes: every old result becomes out of date."""
@@ -122,11 +126,14 @@ def read_manifest(folder: Path) -> Manifest:
     Raises FileNotFoundError if there is none (the stage is not finished), and ValueError if it is damaged.
     """
     try:
-        content = read_json(folder / MANIFEST)
+        content = read_json(folder / MANIFEST, root=folder)
         seal = content.pop("seal")
         if seal != json_digest(content):
             raise ValueError("the manifest was changed")
-        return Manifest.model_validate(content)
+        manifest = Manifest.model_validate(content)
+        if any(name.startswith("/") or ".." in name.split("/") for name in manifest.files):
+            raise ValueError("a file is outside the folder")
+        return manifest
     except FileNotFoundError:
         raise
     except FAULTS as error:  # ValidationError is a ValueError
@@ -134,16 +141,34 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def linked_manifest(run: Path, stage: str) -> Manifest | None:
-    """Return the manifest in ``RUN/<stage>``; None if it is missing or cannot be read."""
+    """Return the manifest in ``RUN/<stage>``; None if it is missing or cannot be read (`has_results`)."""
     try:
-        return read_manifest(run / stage)
+        return read_manifest(run / stage) if has_results(run, stage) else None
     except (OSError, ValueError):
         return None
 
 
+def has_results(run: Path, stage: str) -> bool:
+    """Return True if ``RUN/<stage>`` is a folder of files, or a link to one that the store made.
+
+    Such a link leads to ``<stage>/<key>``, and no folder of the store or of the run on its way is a link.
+    A folder with a link, FIFO or device in it has no results.
+    """
+    folder = run / stage
+    if folder.is_symlink():
+        target, name = folder.readlink(), stage.removeprefix(".").removesuffix(_BEFORE)
+        folder = run / target
+        way = [folder.parent, *(place for place in folder.parents if run in place.parents)]
+        if not re.fullmatch(rf".+/{re.escape(name)}/[0-9a-f]{{64}}", target.as_posix()):
+            return False
+        if ".." in target.parts or any(map(Path.is_symlink, way)):
+            return False
+    return has_only_files(folder)
+
+
 def hidden_link(run: Path, stage: str) -> Path:
     """Return the path of the link to the results that ``stage`` had before its settings or inputs changed."""
-    return run / f".{stage}.before"
+    return run / f".{stage}{_BEFORE}"
 
 
 def last_shown(run: Path, stage: str) -> Manifest | None:
@@ -155,8 +180,8 @@ def published_files(folder: Path) -> dict[str, Path]:
     """Return relative POSIX path -> file, for every output file in ``folder``."""
     return {
         file.relative_to(folder).as_posix(): file
-        for file in sorted(folder.rglob("*"))
-        if file.is_file() and not file.is_symlink() and not is_partial(file) and file != folder / MANIFEST
+        for file in regular_files(folder)
+        if not is_partial(file) and file != folder / MANIFEST
     }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
-from cleargs.manifest import Manifest, read_manifest
+from cleargs.manifest import Manifest, has_results, linked_manifest
 from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_run_file
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
-    done = [name for name in dag.names if (run / name / SCENE).is_file()]
+    done = [name for name in dag.names if (run / name / SCENE).is_file() and has_results(run, name)]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:
         return stage
@@ -57,7 +57,7 @@ class Run:
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of the finished stages, in order."""
-        return tuple(name for name in installed().names if (self.folder / name).is_dir())
+        return tuple(name for name in installed().names if has_results(self.folder, name))
 
     def _repr_html_(self) -> str:
         rows = [("stage", "state", "seconds", "MB")]
@@ -69,12 +69,12 @@ class Run:
     def __getitem__(self, stage: str) -> StageResults:
         """Return the results of a stage. Raises InputError if it is not finished."""
         installed().check(stage)
-        try:
-            return StageResults(self.folder / stage, read_manifest(self.folder / stage))
-        except (OSError, ValueError) as error:
+        manifest = linked_manifest(self.folder, stage)
+        if manifest is None:
             raise InputError(
                 f"{stage} is not finished in {self.folder}", hint=f"see cleargs status {self.folder}"
-            ) from error
+            )
+        return StageResults(self.folder / stage, manifest)
 
     def scene(self, stage: str | None = None) -> Scene:
         """Read the scene of ``stage``, or of the last stage that has one. Raises InputError without one."""

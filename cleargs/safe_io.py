@@ -48,27 +48,54 @@ _BIDI = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\
 TOO_DEEP = "it is nested too deeply"
 
 
-def open_regular(path: Path) -> BufferedReader:
-    """Open the regular file at ``path``, or the one that it links to, for reading.
+def open_regular(path: Path, root: Path | None = None) -> BufferedReader:
+    """Open the regular file at ``path``, or the one that it links to, for reading. ``root``: see `open_own`.
 
     Raises OSError if the file is missing or not readable, or if it is a folder, a FIFO or a device.
+    """
+    return os.fdopen(open_own(path, root), "rb")
+
+
+def open_own(path: Path, root: Path | None, flags: int = os.O_RDONLY) -> int:
+    """Return a descriptor of the regular file at ``path``. Raises OSError like `open_regular`.
+
+    If a folder ``root`` above it is given, neither the file nor a folder between may be a link.
     """
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "the name contains a zero byte", str(path))
     # Without O_NONBLOCK, opening a FIFO would wait for its writer.
-    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    flags |= os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
-        return os.fdopen(handle, "rb")
-    except BaseException:
+        handle = os.open(path, flags, 0o666) if root is None else _open_below(path, root, flags)
+    except OSError as error:
+        if root is None or error.errno not in (errno.ELOOP, errno.ENOTDIR):
+            raise
+        raise OSError(errno.ELOOP, "it is a link, or behind a link", str(path)) from error
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
-        raise
+        raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+    return handle
 
 
-def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Read the regular file at ``path``. Raises OSError like `open_regular`, and for a larger file."""
-    with open_regular(path) as file:
+def _open_below(path: Path, root: Path, flags: int) -> int:
+    """Open ``path`` from ``root`` on, folder by folder, so that no link is followed."""
+    *folders, name = path.relative_to(root).parts
+    handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    steps = [(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC) for folder in folders]
+    for step, how in (*steps, (name, flags)):
+        try:
+            if step == "..":
+                raise OSError(errno.ELOOP, "it leads out of the folder", str(path))
+            inner = os.open(step, how | os.O_NOFOLLOW, 0o666, dir_fd=handle)
+        finally:
+            os.close(handle)
+        handle = inner
+    return handle
+
+
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES, *, root: Path | None = None) -> bytes:
+    """Read the regular file at ``path``. Raises OSError like `open_own`, and for a larger file."""
+    with open_regular(path, root) as file:
         size = os.fstat(file.fileno()).st_size
         if size > max_bytes:
             raise OSError(errno.EFBIG, f"it has {size} bytes, the limit is {max_bytes}", str(path))
@@ -80,10 +107,10 @@ def read_text(path: Path) -> str:
     return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig")
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, max_bytes: int = MAX_TEXT_BYTES, *, root: Path | None = None) -> Any:
     """Read a JSON document. Raises OSError like `read_bytes`, and ValueError if it is not JSON."""
     try:
-        return json.loads(read_bytes(path, MAX_TEXT_BYTES))
+        return json.loads(read_bytes(path, max_bytes, root=root))
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
 

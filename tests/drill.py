@@ -55,7 +55,7 @@ class Drill:
         return Program([*arguments, "--no-report", "--threads", "1", *settings, *more], self.root / "log")
 
     def collect(self, *more: str) -> Program:
-        arguments = ["gc", "--store", str(self.run_folder / ".store"), *more]
+        arguments = ["gc", "--yes", "--store", str(self.run_folder / ".store"), *more]
         return Program(arguments, self.root / "gc.log")
 
     def kill_stage(self, stage: str, seconds: float) -> float:

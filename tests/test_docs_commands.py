@@ -80,8 +80,9 @@ TINY = {
     "synth": "--frames 6 --size 96x54",
     "world": "--frames 6 --size 96x54",
     "render": "--seconds 0.2",
+    "gc": "--yes",
 }
-"""Options that are appended to a command that runs, so that it takes seconds."""
+"""Options that are appended to a command that runs, so that it takes seconds and asks nothing."""
 PLACEHOLDERS = {"N": "1"}
 
 

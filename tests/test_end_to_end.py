@@ -142,7 +142,7 @@ def _copy_before(stage: str, finished: Path, run: Path) -> None:
 
 def _times(run: Path) -> dict[Path, int]:
     """Time of the last change of each file, except those that any run may write: locks, digests, the log."""
-    ignored = (".lock", "digests.sqlite", "run.log")
+    ignored = (".lock", "digests.json", "run.log")
     files = (path for path in run.rglob("*") if path.is_file() and not path.name.startswith(ignored))
     return {path: path.stat().st_mtime_ns for path in files}
 

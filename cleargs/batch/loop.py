@@ -24,19 +24,27 @@ from typing import Literal
 from rich.filesize import decimal
 
 from cleargs.batch.sheet import SceneJob, SheetError
-from cleargs.errors import CleargsError, InputError
+from cleargs.errors import CleargsError, InputError, listed
 from cleargs.files import write_bytes
+from cleargs.own_files import refuse_links
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import SCENE, RunMetadata, RunSpec, read_metadata
+from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
+from cleargs.pipeline.store import is_store, visible_names
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.render import TARGETS
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
+from cleargs.safe_io import read_bytes
 from cleargs.subprocesses import module_command
 from cleargs.types import Device
+
+SUMMARY = "summary.csv"
+
+_HEADER = b"scene,state,"
+"""Begin of a summary."""
 
 State = Literal["failed", "waiting", "partial", "done"]
 """``waiting``: stages are missing, and the last attempt, if any, reported no error."""
@@ -105,7 +113,7 @@ class Batch:
         settings = [word for text in (*self.overrides, *scene.overrides) for word in ("--set", text)]
         until = ["--until", self.until] if self.until else []
         device = "auto" if self.falls_back else self.device
-        run, store = str(self.run_folder(scene)), str(self.folder / "store")
+        run, store = str(self.run_folder(scene)), str(self.store)
         return [
             *("run", str(scene.source), "-o", run, "--store", store),
             *("--recipe", scene.recipe, *settings, *until, "--device", device, *self.options),
@@ -114,8 +122,10 @@ class Batch:
     def check(self, sheet: Path) -> None:
         """Raise SheetError if a scene cannot run, so that hours of work do not end in a missing file.
 
-        Causes are a missing input, a wrong setting, a missing model, or a run folder of another input.
+        Causes are a missing input, a wrong setting, a missing model, or a run folder of another input. Raises
+        InputError if the folder has content and is not a batch, and StoreError if a part of it is a link.
         """
+        self._check_folder()
         problems = []
         for scene in self.scenes:
             try:
@@ -133,6 +143,20 @@ class Batch:
         if problems:
             raise SheetError(sheet, problems)
 
+    def _check_folder(self) -> None:
+        names, summary = visible_names(self.folder), self.folder / SUMMARY
+        refuse_links(self.folder / part for part in ("scenes", "store", "exports", "logs", "report", SUMMARY))
+        refuse_links(place for scene in self.scenes for place in (self.run_folder(scene), self.log(scene)))
+        marks = ("plan.json", f"scenes/*/{RUN_FILE}")  # the Snakefile makes the first, a scene the second
+        known = is_store(self.store) or any(any(self.folder.glob(mark)) for mark in marks)
+        if summary.is_file():
+            known = read_bytes(summary, root=self.folder).startswith(_HEADER)
+        if names and not known:
+            raise InputError(
+                f"{self.folder} is not empty and is not a batch; it has {listed(names)}",
+                hint=f"choose a new or empty folder, for example -o {self.folder / 'batch'}",
+            )
+
     def plan(self, scene: SceneJob) -> list[StagePlan]:
         """Return the state of each stage. Raises CleargsError if the capture cannot be read."""
         run = self._run(scene)
@@ -142,7 +166,7 @@ class Batch:
     def run(self, scene: SceneJob, reporter: Reporter) -> None:
         """Run ``scene`` and the work after it, each in a separate process. Write their output to `log`."""
         self.log(scene).parent.mkdir(parents=True, exist_ok=True)
-        self.log(scene).write_text("", "utf-8")
+        write_bytes(self.log(scene), b"")
         if self._call(scene, self.arguments(scene), reporter) == 0:
             for arguments in self.arguments_after(scene):
                 self.exports.mkdir(exist_ok=True)
@@ -165,6 +189,11 @@ class Batch:
             ages = [file.stat().st_mtime for file in self.exports.glob(pattern)]
             if not ages or min(ages) < made.stat().st_mtime:
                 yield arguments
+
+    @property
+    def store(self) -> Path:
+        """Store of all scenes."""
+        return self.folder / "store"
 
     @property
     def exports(self) -> Path:
@@ -231,7 +260,7 @@ class Batch:
         if unfinished is not None and unfinished.state == "partial":
             return "partial", "; ".join(unfinished.reasons)
         with suppress(OSError):  # no attempt yet
-            lines = self.log(scene).read_text("utf-8", "replace").splitlines()
+            lines = read_bytes(self.log(scene), root=self.folder).decode("utf-8", "replace").splitlines()
             if errors := [line[7:] for line in lines if line.startswith("error: ")]:
                 return "failed", errors[-1]
         return "waiting", ""
@@ -243,7 +272,7 @@ class Batch:
             self.run_folder(scene),
             recipe=scene.recipe,
             overrides=(*self.overrides, *scene.overrides),
-            store=self.folder / "store",
+            store=self.store,
             device="cpu",
             reporter=SilentReporter(),
         )

@@ -21,7 +21,7 @@ from cleargs.media.image import read_rgb
 from cleargs.report.formatting import count, duration
 from cleargs.report.page import page_html
 from cleargs.report.pictures import ImageFile, side_of, write_jpeg
-from cleargs.report.report_json import FOLDER, PAGE, is_current, linked_manifests, page_of
+from cleargs.report.report_json import FOLDER, PAGE, is_current, linked_manifests, page_of, require_own
 
 BYTES = 15_000_000
 """Approximate limit for the size of all thumbnails together."""
@@ -38,6 +38,7 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
     kinds: Counter[str] = Counter(result.state for result in results)
     order = get_args(State)
     pairs = sorted(zip(batch.scenes, results, strict=True), key=lambda pair: order.index(pair[1].state))
+    require_own(batch.folder)
     side = min(MAX_SIDE, side_of(len(results), ASPECT, BYTES, MIN_SIDE))
     with whole_folder(batch.folder / FOLDER, replace=True) as report:
         (report / "scenes").mkdir()

@@ -15,6 +15,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from cleargs.capture.folders import is_inside
+from cleargs.errors import StoreError
 from cleargs.parquet import column, read_table, schema_of
 
 _POSE = "world to camera (COLMAP, OpenCV axes); null when unregistered"
@@ -90,6 +92,8 @@ def load_frames(ingest_dir: Path) -> list[Frame]:
     table = read_table(ingest_dir / "frames.parquet", FRAMES)
     frames = []
     for row in table.to_pylist():
+        if not is_inside(row["image"]):
+            raise StoreError(f"{ingest_dir} names an image outside", hint="do not use this run")
         mask = f"masks/{Path(row['image']).stem}.png"
         frames.append(Frame(**row, mask=mask if (ingest_dir / mask).is_file() else None))
     return sorted(frames, key=lambda frame: frame.frame_id)

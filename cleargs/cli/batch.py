@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from cleargs.batch.loop import Batch, Result, write_summary
+from cleargs.batch.loop import SUMMARY, Batch, Result, write_summary
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.common import (
     answer,
@@ -104,13 +104,16 @@ def batch(
     if dry_run:
         _print_plans(scenes, as_json)
         return 0
-    results = []
+    results: list[Result] = []
+    if not summary and not (root / SUMMARY).exists():  # it marks the folder as that of a batch
+        root.mkdir(parents=True, exist_ok=True)
+        write_summary(root / SUMMARY, results)
     with reporter.task("scenes", len(scenes.scenes)) as task:
         for scene in scenes.scenes:
             if not summary:
                 scenes.run(scene, reporter)
             results.append(result := scenes.result(scene))
-            write_summary(root / "summary.csv", results)
+            write_summary(root / SUMMARY, results)
             reporter.info(_line(result))
             task.advance()
     page = None
@@ -127,7 +130,7 @@ def batch(
         [asdict(result) for result in results],
         *map(_line, results),
         ", ".join(f"{count} {state}" for state, count in states.items()),
-        f"summary: {root / 'summary.csv'}",
+        f"summary: {root / SUMMARY}",
         *([f"report: {page}"] if page else []),
     )
     numbers = ("frames", "frames_placed", "psnr_unseen", "minutes", "memory_gb", "disk_gb")

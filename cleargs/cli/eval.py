@@ -21,8 +21,9 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import file_digest
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
+from cleargs.manifest import has_results
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.pipeline.run_file import RUN_FILE, check_links
 from cleargs.run_results import SCENE, scene_stage
 
 if TYPE_CHECKING:
@@ -240,8 +241,11 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
         raise InputError(
             f"{target} is not a run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
         )
+    check_links(target)
     if "all" in stages:
-        chosen = [name for name in dag.names if (target / name / SCENE).is_file()]
+        chosen = [
+            name for name in dag.names if has_results(target, name) and (target / name / SCENE).is_file()
+        ]
     else:
         chosen = [scene_stage(dag, target, name) for name in dict.fromkeys(stages)]
     return {name: target / name / SCENE for name in chosen or [scene_stage(dag, target, None)]}

@@ -17,6 +17,7 @@ import click
 import cleargs
 from cleargs.cli.commands import ALIASES, COMMANDS, SECTIONS, as_called
 from cleargs.errors import CleargsError, InputError
+from cleargs.files import no_space
 from cleargs.pipeline.dag import Dag, installed
 from cleargs.safe_io import printable, require_utf8
 
@@ -174,15 +175,31 @@ def explanation(error: Exception) -> tuple[int, str, str]:
         case _ if _is_out_of_memory(error):
             return 1, "out of memory", "lower ingest.max_size or ingest.max_frames, or close other programs"
         case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return 1, "no space left on the disk", "free some space (cleargs gc), or choose another --store"
+            full = no_space(Path(error.filename or ".").absolute().parent)
+            return 1, str(full), full.hint
         case OSError():
             cause = f"{error.strerror or _one_line(error)}{f': {error.filename}' if error.filename else ''}"
             if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
                 return 2, cause, "choose another path"
             return 1, cause, "check the disk and its permissions"
+        case _ if variables := _variables(error):
+            return 2, f"the environment variable {variables} cannot be used: {_one_line(error)}", "unset it"
         case _:
             cause = f"unexpected {type(error).__name__}: {_one_line(error)}"
             return 1, cause, "repeat the command with --debug to see the traceback, and please report it"
+
+
+def _variables(error: Exception) -> str:
+    """Return the environment variables that made a library raise ``error``; "" if none did.
+
+    They are those that the source of the failed lines names, and the library's own if its import failed.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    _, _, inside = (frames[-1].filename if frames else "").rpartition("/site-packages/")
+    if "<module>" not in [frame.name for frame in frames] or not inside:
+        return ""
+    text, own = " ".join(frame.line or "" for frame in frames), f"{inside.partition('/')[0].upper()}_"
+    return ", ".join(sorted(name for name in os.environ if f"'{name}'" in text or name.startswith(own)))
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:

@@ -12,8 +12,10 @@ import click
 from cleargs.cli.common import FILE, answer, json_option, run_argument
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
+from cleargs.own_files import regular_files
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
+from cleargs.pipeline.run_file import EVAL, RUN_FILE, SCENE, read_run_file
+from cleargs.report.report_json import ENTRY, FOLDER, linked_manifests
 from cleargs.report.single_file import for_others
 from cleargs.run_results import scene_stage
 
@@ -70,7 +72,8 @@ def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -
 
 
 def _files(run: Path, dag: Dag) -> Iterator[Path]:
-    patterns = [RUN_FILE, "report.html", "report/**/*", "eval/**/*"]
-    patterns += [f"{stage}/{kept}" for stage in dag.names for kept in KEPT]
-    for pattern in patterns:
-        yield from (file for file in run.glob(pattern) if file.is_file())
+    yield from (run / name for name in (RUN_FILE, ENTRY) if (run / name).is_file())
+    for folder in (run / FOLDER, run / EVAL):
+        yield from regular_files(folder)
+    for stage in linked_manifests(run, dag.names):
+        yield from (file for kept in KEPT for file in (run / stage).glob(kept) if file.is_file())

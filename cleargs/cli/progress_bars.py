@@ -15,6 +15,8 @@ import click
 
 from cleargs.cli.commands import as_called
 from cleargs.files import disk_errors
+from cleargs.own_files import append_own
+from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.progress import CountedTask, ForwardingTask, LineReporter, Reporter, Say, Task
 from cleargs.safe_io import printable
 
@@ -60,8 +62,13 @@ class LineFile:
     def __call__(self, text: str) -> None:
         self._waiting.append(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}")
         if self._needed.exists():
-            with disk_errors(self.path), self.path.open("a", encoding="utf-8") as file:
-                file.writelines(f"{line}\n" for line in self._waiting)
+            text = "".join(f"{line}\n" for line in self._waiting)
+            with disk_errors(self.path):
+                if any((place / RUN_FILE).exists() for place in self.path.absolute().parents):
+                    append_own(self.path, text)  # another may have sent the run: links are not followed
+                else:
+                    with self.path.open("a", encoding="utf-8") as file:
+                        file.write(text)
             self._waiting.clear()
 
 

@@ -41,7 +41,7 @@ from cleargs.errors import StageError
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_text
-from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
+from cleargs.pipeline.run_file import RUN_FILE, RUN_LOG, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.pipeline.settings import flattened
@@ -155,7 +155,7 @@ def run(
         device = "auto" if "device" in kept else device
         shortcuts["quality"] = None if "quality" in kept else shortcuts["quality"]
     given = with_shortcuts(overrides, shortcuts)
-    with kept_log(context, folder / "run.log", writes=not dry_run) as log:
+    with kept_log(context, folder / RUN_LOG, writes=not dry_run) as log:
         reporter = make_reporter(quiet)
         settings = resolve_run(
             dag,

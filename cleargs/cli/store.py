@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -11,11 +12,13 @@ import click
 from cleargs.cli.common import FOLDER, answer, json_option, run_argument, store_option
 from cleargs.digest import named_files
 from cleargs.errors import InputError
-from cleargs.manifest import Manifest, damages, read_manifest
+from cleargs.files import remove
+from cleargs.manifest import Manifest, damages, has_results, read_manifest
+from cleargs.own_files import leftovers, size_of
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.pipeline.session import opened_store
-from cleargs.pipeline.store import ROOTS, Store
+from cleargs.pipeline.store import ROOTS, Garbage, Store
 from cleargs.report.formatting import count
 
 
@@ -54,6 +57,10 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
                 continue  # no results yet; a copy of a run has folders instead of links
             stages.append(name)
             try:
+                if folder.exists() and not has_results(settings.folder, name):
+                    raise ValueError(
+                        "there is a link or a device in it, or it is a link that leads elsewhere"
+                    )
                 manifest = read_manifest(folder)
             except (OSError, ValueError) as error:
                 text = "it is no longer in the store" if isinstance(error, OSError) else str(error)
@@ -115,12 +122,15 @@ Examples:
     help="Also remove checkpoints of interrupted work, and cached results of single frames.",
 )
 @click.option("--dry-run", is_flag=True, help="Only show what would be removed.")
+@click.option("--yes", is_flag=True, help="Do not ask, for scripts.")
 @json_option
 @click.pass_obj
 def gc(
-    dag: Dag, run: Path | None, store: Path | None, checkpoints: bool, dry_run: bool, as_json: bool
+    dag: Dag, run: Path | None, store: Path | None, checkpoints: bool, dry_run: bool, yes: bool, as_json: bool
 ) -> None:
     """Remove the results that no run links to. The store is that of RUN, or --store.
+
+    The command lists what it would remove, and asks. It removes only what has a name that ClearGS gives.
 
     A run keeps its results as long as its folder exists where it was last used. If you return to settings
     whose results were removed, the stages run again.
@@ -138,11 +148,38 @@ def gc(
     with opened_store(root) as opened:
         if run is not None and not dry_run:
             opened.add_root(run.absolute())
-        garbage = opened.collect(dag.names, checkpoints=checkpoints, dry_run=dry_run)
-    sized = [(item.bytes, f"{item.kind:<10}  {item.folder.relative_to(opened.root)}") for item in garbage]
-    sized.append((sum(item.bytes for item in garbage), "would be freed" if dry_run else "freed"))
+        found = opened.collect(dag.names, checkpoints=checkpoints, dry_run=True)
+        partial = [Garbage(path, "rubbish", size_of(path)) for path in (leftovers(run) if run else ())]
+        garbage = [*found, *partial]
+        lines = [_sized(item.bytes, f"{item.kind:<10}  {_name(item.folder, opened)}") for item in garbage]
+        size = sum(item.bytes for item in garbage)
+        if garbage and not dry_run:
+            if not yes:
+                if as_json or not sys.stdin.isatty():
+                    raise InputError(
+                        f"gc would remove {count(len(garbage), 'item')}, and cannot ask here",
+                        hint="give --yes; --dry-run lists them",
+                    )
+                click.echo("\n".join([*lines, _sized(size, "in total")]))
+                lines = []
+                if not click.confirm("Remove them?", err=True):
+                    click.echo("nothing was removed")
+                    return
+            chosen = {item.folder for item in found}
+            opened.collect(dag.names, checkpoints=checkpoints, dry_run=False, chosen=chosen)
+            for item in partial:
+                remove(item.folder)
     answer(
         as_json,
         [{"folder": str(item.folder), "kind": item.kind, "bytes": item.bytes} for item in garbage],
-        *(f"{size / 1e6:>9.1f} MB  {text}" for size, text in sized),
+        *lines,
+        _sized(size, "would be freed" if dry_run else "freed"),
     )
+
+
+def _sized(size: int, text: str) -> str:
+    return f"{size / 1e6:>9.1f} MB  {text}"
+
+
+def _name(path: Path, store: Store) -> Path:
+    return path.relative_to(store.root) if path.is_relative_to(store.root) else path

@@ -201,7 +201,7 @@ def write_report(path: Path, report: Report) -> None:
 def read_report(path: Path) -> Report:
     """Read a file of `write_report`. Raises InputError if it is missing or damaged."""
     try:
-        return Report.model_validate_json(read_bytes(path))
+        return Report.model_validate_json(read_bytes(path, root=path.parent))
     except (OSError, ValidationError) as error:
         raise InputError(
             f"cannot read {path}: {str(error).splitlines()[0]}", hint="make it again with `cleargs eval`"

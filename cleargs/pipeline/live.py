@@ -16,11 +16,15 @@ from pydantic import Field
 from cleargs.base_model import FrozenModel
 from cleargs.errors import StoreError
 from cleargs.files import write_json
+from cleargs.own_files import nodes_below
 from cleargs.pipeline.store import writer_is_alive
 from cleargs.progress import COMPILING, PREVIEW, ForwardingTask, Reporter, Task
 from cleargs.safe_io import FAULTS, read_json
 
 PROGRESS_FILE = ".at_work.json"
+
+MAX_BYTES = 16_384
+"""Maximum size of a progress file that is read."""
 
 WRITE_INTERVAL_S = 2.0
 """Seconds between two writes of the progress file, at least."""
@@ -30,7 +34,7 @@ class RunningStage(FrozenModel):
     """Progress of a stage."""
 
     stage: str
-    work: str = Field(pattern=r"^[^/\x00]+$")
+    work: str = Field(pattern=r"^[0-9A-Za-z][^/\x00]*$", max_length=200)
     """Name of its work folder in the store."""
     label: str
     """The current task."""
@@ -45,7 +49,7 @@ class RunningStage(FrozenModel):
 def running_stage(run: Path, store: Path) -> RunningStage | None:
     """Return the progress of the run in the folder ``run``; None if no process is running it."""
     try:
-        found = RunningStage.model_validate(read_json(run / PROGRESS_FILE))
+        found = RunningStage.model_validate(read_json(run / PROGRESS_FILE, MAX_BYTES, root=run))
     except FAULTS:  # ValidationError is a ValueError
         return None
     return found if writer_is_alive(store / "work" / found.work) else None
@@ -62,10 +66,10 @@ class Preview(NamedTuple):
 def preview_of(found: RunningStage, store: Path) -> Preview | None:
     """Return the newest preview of the running stage; None if there is none."""
     previews = []
-    for path in (store / "work" / found.work / "checkpoints").rglob(PREVIEW):
+    for node in nodes_below(store / "work" / found.work / "checkpoints"):
         with suppress(OSError):  # the stage replaced or removed it
-            if path.is_file() and not path.is_symlink():
-                previews.append(Preview(path.stat().st_mtime_ns, path))
+            if node.name == PREVIEW and node.is_file(follow_symlinks=False):
+                previews.append(Preview(node.stat().st_mtime_ns, Path(node.path)))
     return max(previews, default=None)
 
 

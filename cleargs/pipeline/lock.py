@@ -11,8 +11,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from cleargs.files import disk_errors
+from cleargs.files import acquire_lock, disk_errors
 from cleargs.progress import Reporter
+from cleargs.safe_io import open_own, read_bytes
+
+MAX_NOTE_BYTES = 4096
+"""Maximum size of the note in a lock file that is read."""
 
 
 @contextmanager
@@ -25,12 +29,12 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
     while True:
         with disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            handle = open_own(path, path.parent, os.O_RDWR | os.O_CREAT)
         try:
-            held = _acquire(handle, shared=shared, wait=wait)
+            held = acquire_lock(handle, shared=shared, wait=wait)
             present = None
             with suppress(FileNotFoundError):
-                present = path.stat().st_ino
+                present = path.lstat().st_ino
             if held and present != os.fstat(handle).st_ino:
                 continue  # the last holder removed the file while this process waited: lock the new one
             yield held
@@ -51,37 +55,32 @@ def exclusive_lock(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
         if held is False:
             holder = ""
             with suppress(OSError, UnicodeDecodeError):
-                holder = path.read_text(encoding="utf-8")
+                holder = read_bytes(path, MAX_NOTE_BYTES, root=path.parent).decode()
             reporter.info(f"{what}: {holder or 'another process'} works on it; waiting for it to end")
             held = stack.enter_context(file_lock(path))
         job = f" (Slurm job {os.environ['SLURM_JOB_ID']})" if os.environ.get("SLURM_JOB_ID") else ""
         with suppress(OSError):  # only messages use the note
-            path.write_text(f"process {os.getpid()} on {socket.gethostname()}{job}", encoding="utf-8")
+            _write_note(path, f"process {os.getpid()} on {socket.gethostname()}{job}")
         yield held is not None
+
+
+def _write_note(path: Path, note: str) -> None:
+    """Write the note of a holder. A file with other content, or with a second name, is not ours and stays."""
+    with os.fdopen(open_own(path, path.parent, os.O_RDWR), "r+b") as file:
+        status = os.fstat(file.fileno())
+        if status.st_nlink == 1 and (not status.st_size or file.read(8) == b"process "):
+            file.seek(0)
+            file.truncate()
+            file.write(note.encode())
 
 
 def is_locked(path: Path) -> bool:
     """Return True if a process holds an exclusive lock on ``path``, or if the file system has no locks."""
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        handle = open_own(path, path.parent)
     except OSError:
         return False
     try:
-        return _acquire(handle, shared=True, wait=False) is not True
+        return acquire_lock(handle, shared=True, wait=False) is not True
     finally:
         os.close(handle)
-
-
-def _acquire(handle: int, *, shared: bool, wait: bool) -> bool | None:
-    try:
-        import fcntl
-    except ImportError:  # a Python without it: as on a file system without locks
-        return None
-    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    try:
-        fcntl.flock(handle, kind if wait else kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True

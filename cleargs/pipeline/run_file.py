@@ -10,6 +10,7 @@ import tomli_w
 
 from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_errors, write_bytes
+from cleargs.own_files import nodes_below, refuse_links
 from cleargs.pipeline.config import Config, Document, check_document, known_settings, read_toml
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.store import STORE_FOLDER
@@ -20,8 +21,17 @@ RUN_FILE = "run.toml"
 SCENE = "scene.ply"
 """File of the scene in the results of a stage that trains, and link to the last of them in the run folder."""
 
+EVAL = "eval"
+"""Folder in a run with the results of ``cleargs eval``."""
+
+RUN_LOG = "run.log"
+"""File in a run with the messages of all calls."""
+
 LOCK = ".lock"
 """Lock file of the process that works in the run folder."""
+
+OWN_NAMES = (RUN_FILE, LOCK, RUN_LOG, EVAL, ".at_work.json", "report", "report.html")
+"""Files and folders in a run that ClearGS reads or writes, apart from those of the stages."""
 
 HEADER = """\
 # The full configuration of this run. All commands on the run read it. `cleargs run` keeps these settings
@@ -88,6 +98,21 @@ def _settings_toml(config: Config) -> str:
     return "".join(f"\n[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
 
 
+def check_links(folder: Path) -> None:
+    """Raise StoreError if a file or folder of the run is a link, or if a folder in ``eval`` is one.
+
+    The links to results are not checked here, but when they are used (`cleargs.manifest.has_results`).
+    """
+    refuse_links(folder / name for name in OWN_NAMES)
+    refuse_links(Path(node.path) for node in nodes_below(folder / EVAL) if node.is_dir())
+
+
+def checked_store(run: Path, store: Path) -> Path:
+    """Return ``store``. Raise StoreError if it is below ``run`` and behind a link there."""
+    refuse_links([place for place in (store, *store.parents) if run in place.parents])
+    return store
+
+
 @dataclass(frozen=True)
 class RunMetadata:
     """Content of an existing ``run.toml``; None for an entry that is missing or invalid."""
@@ -106,10 +131,11 @@ def read_metadata(folder: Path) -> RunMetadata:
     """Return the content of ``run.toml`` in ``folder``, or empty metadata if there is none.
 
     An invalid input, store, device or on_cpu does not hide the others. Raises ConfigError if the file is not
-    valid TOML.
+    valid TOML, and StoreError like `check_links`.
     """
     if not (folder / RUN_FILE).is_file():
         return RunMetadata()
+    check_links(folder)
     document = read_toml(folder / RUN_FILE)
     given = {name: document.pop(name, None) for name in ("input", "store", "device")}
     paths = {
@@ -151,7 +177,7 @@ def read_run_file(
         raise damaged_run_file(folder)
     settings, _ = known_settings(dag, metadata.settings)
     config = check_document(dag, settings)
-    place = store or metadata.store or folder / STORE_FOLDER
+    place = checked_store(folder, store or metadata.store or folder / STORE_FOLDER)
     on_cpu, chosen = (metadata.on_cpu, metadata.device) if device is None else ((), device)
     return RunSpec(folder, metadata.source, config, place, chosen or "cpu", on_cpu, device is None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import resource
 import sys
@@ -20,6 +21,7 @@ from cleargs.manifest import (
     FileRecord,
     Manifest,
     damages,
+    has_results,
     last_shown,
     plain_json,
     published_files,
@@ -94,6 +96,8 @@ class Runner(Planner):
                     self._revise(plans[1:], done)
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
+            if os.path.lexists(self.run.folder / SCENE) and not self._has_scene_link():
+                self.reporter.warn(f"{self.run.folder / SCENE} was not made by ClearGS, and is not the scene")
         return outcomes
 
     def _unlink_outdated(self) -> None:
@@ -105,12 +109,18 @@ class Runner(Planner):
     def _link_scene(self) -> None:
         """Let ``RUN/scene.ply`` point to the scene of the last stage that has one; remove it if none has."""
         folder, link = self.run.folder, self.run.folder / SCENE
-        targets = [Path(name, SCENE) for name in self.dag.names if (folder / name / SCENE).is_file()]
+        done = [name for name in self.dag.names if has_results(folder, name)]
+        targets = [Path(name, SCENE) for name in done if (folder / name / SCENE).is_file()]
         with disk_errors(link):
-            if link.is_symlink() and link.readlink() not in targets[-1:]:
+            if self._has_scene_link() and link.readlink() not in targets[-1:]:
                 link.unlink()
             if targets and not link.is_symlink() and not link.exists():
                 link.symlink_to(targets[-1])
+
+    def _has_scene_link(self) -> bool:
+        """Return True if ``RUN/scene.ply`` is a link that ClearGS made."""
+        link = self.run.folder / SCENE
+        return link.is_symlink() and link.readlink() in [Path(name, SCENE) for name in self.dag.names]
 
     def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
         """Report the cost of the remaining stages again: it is better known once the capture is read."""

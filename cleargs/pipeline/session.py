@@ -17,11 +17,12 @@ from cleargs.pipeline.run_file import (
     RUN_FILE,
     RunMetadata,
     RunSpec,
+    checked_store,
     damaged_run_file,
     read_metadata,
     read_source,
 )
-from cleargs.pipeline.store import STORE_FOLDER, Store
+from cleargs.pipeline.store import MEMO, STORE_FOLDER, Store, check_store, is_store, visible_names
 from cleargs.progress import Reporter
 from cleargs.types import Device
 
@@ -73,9 +74,13 @@ def resolve_device(
 
 @contextmanager
 def opened_store(root: Path) -> Iterator[Store]:
-    """Yield the store at ``root`` with its digest memo. The folder is created when the first stage starts."""
+    """Yield the store at ``root`` with its digest memo. The folder is created when the first stage starts.
+
+    Raises InputError if the folder has content that is not of a store, and StoreError like `check_store`.
+    """
     root = root.absolute()
-    with DigestMemo(root / "digests.sqlite") as memo:
+    check_store(root)
+    with DigestMemo(root / MEMO) as memo:
         yield Store(root, memo)
 
 
@@ -122,6 +127,12 @@ def resolve_run(
             hint=f"give the capture of this run{f': {made_from}' if made_from else ''}",
         )
     folder, forgets = folder.absolute(), reset or recipe is not None
+    is_run = (folder / RUN_FILE).is_file() or is_store(folder / STORE_FOLDER)
+    if not is_run and folder != source.absolute() and (names := visible_names(folder)):
+        raise InputError(
+            f"{folder} is not empty and is not a run; it has {listed(names)}",
+            hint=f"choose a new or empty folder, for example -o {folder / default_folder(source).name}",
+        )
     metadata, kept = RunMetadata(), None
     try:
         metadata = read_metadata(folder)
@@ -137,7 +148,7 @@ def resolve_run(
                 f"the settings of {folder} cannot be used: {error}", hint="start from the recipe with --reset"
             ) from error
     config = load_config(dag, recipe or "default" if kept is None else kept.document(), overrides, seed)
-    root = (store or metadata.store or folder / STORE_FOLDER).absolute()
+    root = checked_store(folder, (store or metadata.store or folder / STORE_FOLDER).absolute())
     keeps = device == "auto" and metadata.device is not None
     chosen = resolve_device(device, reporter.info, kept=metadata.device, test=test_gpu)
     if kept is not None:

@@ -8,37 +8,51 @@
     STORE/kept/<stage>/                    cache of results per item, by digest; safe to delete
     STORE/locks/store.lock                 shared lock of all processes that use the store
     STORE/roots/                           the runs that use the store
-    STORE/digests.sqlite                   digests of files that were read before
+    STORE/digests.json                     digests of files that were read before
 
 On a file system without locks, each process works in its own folder, ``<key>@<process>``. If several make the
 same results, the first rename into ``STORE/<stage>/`` wins.
+
+The store makes no links. It refuses or removes those that another made, and does not follow them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
+import secrets
 import shutil
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from cleargs.digest import DigestMemo
-from cleargs.errors import StoreError
-from cleargs.files import disk_errors, is_partial, sync, sync_tree, write_bytes
+from cleargs.errors import InputError, StoreError, listed
+from cleargs.files import disk_errors, is_partial, remove, sync, sync_tree, write_bytes
 from cleargs.manifest import MANIFEST, Manifest, damages, hidden_link, read_manifest, write_manifest
+from cleargs.own_files import drop_links, has_only_files, refuse_links, size_of
 from cleargs.pipeline.lock import exclusive_lock, file_lock, is_locked
 from cleargs.progress import Reporter
-from cleargs.safe_io import FAULTS, read_text
+from cleargs.safe_io import FAULTS, read_bytes
 
 STORE_FOLDER = ".store"
 """Folder of the store in a run, by default."""
 
 ROOTS = "roots"
 """Folder in a store with one file per run that uses it."""
+
+MEMO = "digests.json"
+"""File in a store with the digests of files that were read before."""
+
+_KEY = r"[0-9a-f]{64}"
+_WORK = re.compile(rf"{_KEY}(\.forced)?(@.+)?")
+_RUBBISH = re.compile(r"\.rubbish-.+-\w+")
+_CACHED = re.compile(rf"{_KEY}(\.\w+)?")
+"""Forms of the names of results, work folders, remains of deleted folders, and files of a cache."""
 
 SECONDS = "seconds"
 """File in a work folder with the time that earlier attempts took, in seconds."""
@@ -115,6 +129,8 @@ class Store:
         only files that changed since the memo read them.
         """
         folder = self.folder(stage, key)
+        if os.path.lexists(folder) and not has_only_files(folder):
+            return Entry(folder, None, "there is a link or a device in it")
         try:
             manifest = read_manifest(folder)
         except FileNotFoundError:
@@ -128,7 +144,7 @@ class Store:
     def in_use(self) -> AbstractContextManager[object]:
         """Hold a shared lock, so that ``cleargs gc`` in another process cannot remove data in use.
 
-        A read-only store has no lock. Its results can still be shown.
+        A store that this user may only read has no lock. Its results can still be used.
         """
         if self._only_readable():
             return nullcontext()
@@ -151,7 +167,8 @@ class Store:
                         folder.rename(folder.with_name(folder.name.removesuffix(self._owner_suffix())))
 
     def _only_readable(self) -> bool:
-        return self.root.is_dir() and not os.access(self.root, os.W_OK)
+        places = (self.root, self.root / "locks", self.root / "locks" / "store.lock", self.root / ROOTS)
+        return any(place.exists() and not os.access(place, os.W_OK) for place in places)
 
     def _owner_suffix(self) -> str:
         """Return the suffix of this process's work folders on a file system without locks."""
@@ -181,6 +198,7 @@ class Store:
                 left, work = work, WorkFolder(work.folder.with_name(work.folder.name + self._owner_suffix()))
                 with suppress(OSError):  # there is none, or another process took it over
                     left.folder.rename(work.folder)
+            drop_links(work.folder, work.out)
             _keep_only(work.out, leftovers)
             if entry is not None and entry.usable is not None and not forced and not work.out.exists():
                 _link_files(entry.folder, work.out)
@@ -230,11 +248,12 @@ class Store:
 
     def discard(self, folder: Path) -> None:
         """Rename ``folder`` in one step, so that no process uses it any more, then delete it."""
-        rubbish = self.root / "work" / f".rubbish-{folder.name}-{os.getpid()}"
+        rubbish = self.root / "work" / f".rubbish-{folder.name.lstrip('.')}-{secrets.token_hex(4)}"
         rubbish.parent.mkdir(parents=True, exist_ok=True)
         with disk_errors(folder), suppress(FileNotFoundError):
             folder.rename(rubbish)
-        shutil.rmtree(rubbish, ignore_errors=True)
+        with suppress(OSError):
+            remove(rubbish)
 
     def link(self, run: Path, stage: str, key: str) -> None:
         """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN."""
@@ -248,9 +267,8 @@ class Store:
             raise StoreError(
                 f"{link} is a folder, not a link into the store", hint="move it, or choose another -o"
             )
-        temporary = run / f".{stage}.link-{os.getpid()}"
+        temporary = run / f".{stage}.link-{secrets.token_hex(4)}"
         with disk_errors(link):
-            temporary.unlink(missing_ok=True)
             temporary.symlink_to(target)
             temporary.replace(link)
             hidden_link(run, stage).unlink(missing_ok=True)
@@ -271,11 +289,19 @@ class Store:
                 note.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(note, f"{run}\n".encode())
 
-    def collect(self, stages: tuple[str, ...], *, checkpoints: bool, dry_run: bool) -> list[Garbage]:
+    def collect(
+        self,
+        stages: tuple[str, ...],
+        *,
+        checkpoints: bool,
+        dry_run: bool,
+        chosen: Collection[Path] | None = None,
+    ) -> list[Garbage]:
         """Remove finished results that no run links to, and the remains of deleted folders. Return them.
 
-        With ``checkpoints``, unfinished work and the cache of results per item are removed too. ``dry_run``
-        removes nothing. Raises StoreError if a process uses the store, or if the file system cannot tell.
+        With ``checkpoints``, unfinished work and the cache of results per item are removed too. Only names of
+        the form that the store gives are removed, and of these only the ``chosen`` ones. ``dry_run`` removes
+        nothing. Raises StoreError if a process uses the store, or if the file system cannot tell.
         """
         with file_lock(self.root / "locks" / "store.lock", wait=False) as locked:
             if locked is False:
@@ -288,30 +314,31 @@ class Store:
             runs = [self.root.parent] if self.root.name == STORE_FOLDER else []
             for note in (self.root / ROOTS).glob("*"):
                 with suppress(*FAULTS):
-                    runs.append(Path(read_text(note).rstrip("\n")))
+                    runs.append(Path(read_bytes(note, 65_536, root=self.root).decode().rstrip("\n")))
             links = [run / stage for run in runs for stage in stages]
             linked = {link.resolve() for link in links if link.is_symlink()}
             folders: list[tuple[Path, Kind]] = [
                 (folder, "finished")
                 for stage in stages
                 for folder in sorted((self.root / stage).glob("*"))
-                if folder.resolve() not in linked
+                if re.fullmatch(_KEY, folder.name) and folder.resolve() not in linked
             ]
             for folder in sorted((self.root / "work").glob("*")):
-                folders.append((folder, "rubbish" if folder.name.startswith(".rubbish-") else "unfinished"))
-            folders += [(folder, "kept") for folder in sorted((self.root / "kept").glob("*"))]
+                if _RUBBISH.fullmatch(folder.name) or _WORK.fullmatch(folder.name):
+                    folders.append((folder, "rubbish" if folder.name.startswith(".") else "unfinished"))
+            for folder in sorted(self.root / "kept" / stage for stage in stages):
+                if has_only_files(folder) and all(map(_is_cached, folder.iterdir())):
+                    folders.append((folder, "kept"))
             found = [
-                Garbage(
-                    folder, kind, sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-                )
+                Garbage(folder, kind, size_of(folder))
                 for folder, kind in folders
-                if checkpoints or kind in ("finished", "rubbish")
+                if (checkpoints or kind in ("finished", "rubbish")) and (chosen is None or folder in chosen)
             ]
             if not dry_run:
                 for garbage in found:
                     self.discard(garbage.folder)
                 for lock in (self.root / "locks").glob("*.lock"):
-                    if lock.name != "store.lock":
+                    if re.fullmatch(_KEY, lock.stem):
                         lock.unlink(missing_ok=True)
         return found
 
@@ -325,10 +352,46 @@ class Garbage:
     bytes: int
 
 
+def check_store(root: Path) -> None:
+    """Check that ``root`` is a store, or that one may be made there.
+
+    Raises InputError if it has content and is not a store, and StoreError if a link or a device is in it.
+    """
+    if root.name == STORE_FOLDER:
+        refuse_links([root])
+    if root.is_dir():
+        refuse_links(root.iterdir())
+        if (names := visible_names(root)) and not is_store(root):
+            raise InputError(
+                f"{root} is not empty and is not a store; it has {listed(names)}",
+                hint=f"choose a new or empty folder, for example --store {root / 'store'}",
+            )
+
+
+def is_store(root: Path) -> bool:
+    """Return True if ``root`` has a part that every store has."""
+    return (
+        (root / "locks" / "store.lock").is_file()
+        or any(re.fullmatch(r"[0-9a-f]{16}", note.name) for note in (root / ROOTS).glob("*"))
+        or any(re.fullmatch(_KEY, manifest.parent.name) for manifest in root.glob(f"*/*/{MANIFEST}"))
+    )
+
+
+def visible_names(folder: Path) -> list[str]:
+    """Return the names in ``folder`` that are not hidden, those of folders with a slash at their ends."""
+    places = sorted(folder.iterdir()) if folder.is_dir() else []
+    shown = (place for place in places if not place.name.startswith(".") and place.name != "lost+found")
+    return [f"{place.name}/" if place.is_dir() else place.name for place in shown]
+
+
 def writer_is_alive(work: Path) -> bool:
     """Return True if a process is using the work folder ``work``."""
     key = work.name.partition("@")[0].removesuffix(".forced")
-    return work.is_dir() and is_locked(work.parent.parent / "locks" / f"{key}.lock")
+    return work.is_dir() and not work.is_symlink() and is_locked(work.parent.parent / "locks" / f"{key}.lock")
+
+
+def _is_cached(file: Path) -> bool:
+    return is_partial(file) or _CACHED.fullmatch(file.name) is not None
 
 
 def _keep_only(out: Path, patterns: Sequence[str]) -> None:

@@ -39,7 +39,15 @@ from cleargs.report.frames import (
 )
 from cleargs.report.outcome import outcome
 from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
-from cleargs.report.report_json import ENTRY, PAGE, cameras_of, linked_manifests, page_of, write_report_json
+from cleargs.report.report_json import (
+    ENTRY,
+    PAGE,
+    cameras_of,
+    linked_manifests,
+    page_of,
+    require_own,
+    write_report_json,
+)
 from cleargs.report.single_file import single_file_size
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
 from cleargs.splat.backend import set_threads
@@ -88,6 +96,7 @@ def write_report(planner: Planner) -> Path:
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
         raise InputError(f"no stage of {run} is finished", hint=f"see cleargs status {run}")
+    require_own(run)
     set_threads(planner.threads)
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import cleargs
-from cleargs.files import write_json
+from cleargs.errors import StoreError, listed
+from cleargs.files import remove, write_json
 from cleargs.manifest import Manifest, linked_manifest
-from cleargs.safe_io import FAULTS, read_json
+from cleargs.own_files import leftovers, refuse_links, regular_files
+from cleargs.safe_io import FAULTS, read_bytes, read_json
 
 FOLDER, PAGE, REPORT_JSON = "report", "index.html", "report.json"
 ENTRY = "report.html"
 """File in the run folder that leads to the report."""
+
+_OURS = re.compile(
+    r"index\.html|report\.json|(viewer|scene)\.js|scene\.jpg|viewer-LICENSE\.txt"
+    r"|frames/\d+(-[a-z]+)?\.jpg|scenes/[^/]+\.jpg"
+)
+"""Files of a report, relative to its folder."""
 
 
 def page_of(run: Path) -> Path:
@@ -31,9 +40,32 @@ def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
 def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
     """Return True if the report of ``run`` shows the results of ``manifests`` and has this version."""
     with suppress(*FAULTS):
-        made_from = read_json(run / FOLDER / REPORT_JSON)["made_from"]
+        made_from = read_json(run / FOLDER / REPORT_JSON, root=run)["made_from"]
         return page_of(run).is_file() and _made_from(manifests) == made_from
     return False
+
+
+def require_own(run: Path) -> None:
+    """Raise StoreError if the report of a run or batch would replace what is not a report of ClearGS.
+
+    Partial reports of processes that died are deleted.
+    """
+    folder, entry = run / FOLDER, run / ENTRY
+    refuse_links([folder, entry])
+    names = [file.relative_to(folder).as_posix() for file in regular_files(folder)]
+    others = [f"{folder}/{name}" for name in names if not _OURS.fullmatch(name) or PAGE not in names]
+    for page, mark in ((folder / PAGE, b'"generator" content="ClearGS '), (entry, b"url=report/index.html")):
+        noted = page != entry and REPORT_JSON in names
+        if page.exists() and not noted and mark not in read_bytes(page, root=run)[:4096]:
+            others.append(str(page))
+    if others or folder.is_file():
+        raise StoreError(
+            f"{listed(others or [str(folder)])}: not made by ClearGS, and in the place of the report",
+            hint="move it to another folder",
+        )
+    for name in (FOLDER, f"{FOLDER}.old"):
+        for leftover in leftovers(run, name):
+            remove(leftover)
 
 
 def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:

@@ -7,6 +7,7 @@ make a browser request this server under a foreign name (DNS rebinding), so the 
 from __future__ import annotations
 
 import json
+import os
 import socket
 import sys
 from collections.abc import Mapping
@@ -25,8 +26,8 @@ from cleargs.manifest import plain_json
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
 from cleargs.pipeline.run_file import RunSpec
-from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
-from cleargs.safe_io import faults_as
+from cleargs.report.report_json import FOLDER, PAGE, is_current, linked_manifests, page_of
+from cleargs.safe_io import faults_as, open_own
 
 _PAGES: Mapping[str, str] = {"/": "live.html", "/live.css": "live.css", "/live.js": "live.js"}
 _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'"
@@ -103,11 +104,12 @@ class _Handler(SimpleHTTPRequestHandler):
             work = running_stage(self._run.folder, self._run.store)
             preview = None if work is None else preview_of(work, self._run.store)
             return "" if preview is None else str(preview.path)
-        report = self._run.folder.resolve() / FOLDER
-        with suppress(OSError, ValueError, RuntimeError):  # a zero byte, a long name, a loop of links
-            file = Path(super().translate_path(path)).resolve()
-            if file == report or (file.is_relative_to(report) and file.is_file()):
-                return str(file)
+        report = self._run.folder / FOLDER
+        file = Path(super().translate_path(path)) / (PAGE if url_path == f"/{FOLDER}/" else "")
+        with suppress(OSError, ValueError):  # a link, a zero byte, a long name, a file outside the report
+            if file.relative_to(report).parts:  # the folder itself is redirected to its page
+                os.close(open_own(file, self._run.folder))
+            return str(file)
         return ""
 
     def list_directory(self, path: Any) -> None:

@@ -11,6 +11,8 @@ from typing import Annotated, Any
 
 import pyarrow as pa
 
+from cleargs.capture.folders import is_inside
+from cleargs.errors import StoreError
 from cleargs.media.exr import Layer, read_exr
 from cleargs.parquet import read_table, schema_of, write_table
 from cleargs.rivr.candidates import CANDIDATES, Chosen, Source
@@ -63,6 +65,8 @@ class Selection:
         """
         if self.exr is None:
             raise ValueError(f"frame {self.frame_id} was not tried")
+        if not is_inside(self.exr):
+            raise StoreError(f"{rivr} names an EXR outside", hint="do not use this run")
         return read_exr(rivr / self.exr).layers
 
     @classmethod

@@ -279,3 +279,29 @@ def test_child_starts_without_a_script_next_to_python(
     monkeypatch.setattr(sys, "executable", str(python))
     done = subprocess.run([*program(), "--version"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.startswith("cleargs, version "), done.stderr
+
+
+@pytest.mark.parametrize("name", ["report/thesis.tex", "summary.csv", "exports/a.ply", "logs/barn.log"])
+def test_a_folder_with_other_content_is_no_batch(
+    toys: ToyBatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    mine = toys.folder / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("years of work")
+    assert toys.run() == 2 and "is not a batch" in capsys.readouterr().err
+    assert mine.read_text() == "years of work" and len(list(toys.folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize("name", ["scenes", "logs", "logs/barn.log", "scenes/barn", "exports", "summary.csv"])
+def test_links_in_a_batch_are_refused(toys: ToyBatch, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    assert toys.run() == 0
+    place, goal = toys.folder / name, toys.folder.parent / "outside"
+    if place.exists():
+        place.rename(goal)
+    else:
+        goal.mkdir()
+    place.symlink_to(goal)
+    before = {path: path.stat().st_mtime_ns for path in (goal, *goal.rglob("*"))}
+    capsys.readouterr()
+    assert toys.run() in (1, 2) and "is a link" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in (goal, *goal.rglob("*"))} == before

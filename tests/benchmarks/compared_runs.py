@@ -25,6 +25,6 @@ def compare_runs(root: Path) -> tuple[Path, Comparison]:
     out = root / "out"
     out.mkdir()
     recipe = SceneRecipe(runs[0].dag, "default", (), "cpu", 1, EvalOptions(lpips=(), scorers=()))
-    with DigestMemo(root / "digests.sqlite") as memo:
+    with DigestMemo(root / "digests.json") as memo:
         made = [scene_of_run(run.folder, run.dag, None) for run in runs]
         return out, compare_scenes(out, made, recipe, Store(root, memo), SilentReporter())

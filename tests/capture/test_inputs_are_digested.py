@@ -51,7 +51,7 @@ def digests(folder: Path, memo: DigestMemo) -> dict[str, dict[str, str]]:
 def test_a_listed_image_counts_wherever_it_lies(posed: Path, tmp_path: Path, how: str) -> None:
     file = ELSEWHERE[how](posed)
     assert file.resolve() in {frame.path.resolve() for frame in open_capture(posed, IngestConfig()).frames}
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         before = digests(posed, memo)
         cv2.imwrite(str(file), np.zeros((240, 320, 3), np.uint8))
         assert digests(posed, memo) != before
@@ -62,7 +62,7 @@ def test_a_listed_mask_counts_wherever_it_lies(posed: Path, tmp_path: Path) -> N
     data["frames"][0]["mask_path"] = "../mask.png"
     (posed / "transforms.json").write_text(json.dumps(data))
     cv2.imwrite(str(posed.parent / "mask.png"), np.full((240, 320), 255, np.uint8))
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         before = digests(posed, memo)
         cv2.imwrite(str(posed.parent / "mask.png"), np.zeros((240, 320), np.uint8))
         assert digests(posed, memo) != before
@@ -88,5 +88,5 @@ def test_what_is_no_regular_file_is_named_at_once(images: Path, tmp_path: Path, 
         os.mkfifo(place)
     else:
         place.symlink_to("/dev/zero")
-    with DigestMemo(tmp_path / "memo.sqlite") as memo, pytest.raises(InputError, match="not a regular file"):
+    with DigestMemo(tmp_path / "memo.json") as memo, pytest.raises(InputError, match="not a regular file"):
         digests(images, memo)

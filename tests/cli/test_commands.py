@@ -240,7 +240,7 @@ def test_gc(shell: Shell) -> None:
     folder = str(shell.bench.folder)
     garbage = json.loads(shell("gc", folder, "--dry-run", "--json")[1])
     assert len(garbage) == 2 and all(Path(item["folder"]).exists() for item in garbage)
-    shell("gc", folder)
+    shell("gc", folder, "--yes")
     assert not any(Path(item["folder"]).exists() for item in garbage)
     assert "reused: count, square, total" in shell.run()[1]
 

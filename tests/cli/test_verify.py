@@ -26,7 +26,7 @@ def rot(bench: Bench, file: Path) -> None:
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
     file.write_bytes(bytes(data))
-    with DigestMemo(bench.store / "digests.sqlite") as memo:
+    with DigestMemo(bench.store / "digests.json") as memo:
         memo.remember(file, known)
 
 

@@ -169,7 +169,7 @@ def run_on(
         device=device,
         reporter=bench.remarks,
     )
-    with DigestMemo(settings.store / "digests.sqlite") as memo:
+    with DigestMemo(settings.store / "digests.json") as memo:
         runner = Runner(bench.dag, settings, Store(settings.store, memo), 1, bench.remarks)
         return runner.run_until(until)
 

@@ -19,7 +19,7 @@ KILLS = int(os.environ.get("CLEARGS_KILLS", "6"))
 
 
 def collect(bench: Bench, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, PROGRAM, bench.journal, "gc", "--store", bench.store, *options]
+    command = [sys.executable, PROGRAM, bench.journal, "gc", "--store", bench.store, "--yes", *options]
     return subprocess.Popen(
         [str(part) for part in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -63,7 +63,7 @@ def test_run_without_locks(bench: Bench) -> None:
 def test_without_locks_the_rename_decides(bench: Bench) -> None:
     bench.run()
     manifest = read_manifest(bench.folder / "total")
-    with DigestMemo(bench.root / "memo.sqlite") as memo:
+    with DigestMemo(bench.root / "memo.json") as memo:
         first, second = Store(bench.root / "shared", memo), Store(bench.root / "shared", memo)
         second._owner_suffix = lambda: "@another-node-1"  # type: ignore[method-assign]
         key, result = manifest.key, (bench.folder / "total" / "total.txt").read_bytes()
@@ -95,7 +95,7 @@ def test_without_locks_a_failed_attempt_is_resumed(bench: Bench) -> None:
 def test_without_locks_nothing_is_removed(bench: Bench) -> None:
     bench.run("square.power=3")
     bench.run()
-    with DigestMemo(bench.store / "digests.sqlite") as memo:
+    with DigestMemo(bench.store / "digests.json") as memo:
         store = Store(bench.store, memo)
         assert store.collect(bench.dag.names, checkpoints=False, dry_run=True)
         with pytest.raises(StoreError, match="has no locks"):

@@ -299,7 +299,7 @@ def test_pace_is_not_measured_for_short_or_gpu_work(bench: Bench) -> None:
     slow.run()
     assert machine.measured == 1 and slow.run() and machine.measured == 1
     on_gpu = replace(bench.settings(["square.power=3"]), device="cuda")
-    with DigestMemo(bench.store / "digests.sqlite") as memo:
+    with DigestMemo(bench.store / "digests.json") as memo:
         planner = Planner(slow.dag, on_gpu, Store(on_gpu.store, memo), 1, bench.remarks)
         assert planner.at_measured_pace(plans := planner.plan()) == plans
     assert machine.measured == 1
@@ -318,7 +318,7 @@ def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_pat
     other = tmp_path / "other"
     shutil.copytree(bench.capture, other)
     settings = replace(bench.settings(), source=other)
-    store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
+    store = Store(bench.store, DigestMemo(bench.store / "digests.json"))
     check_same_input(settings, bench.dag, store)  # the same content elsewhere is the same capture
     (other / "0.txt").write_text("100")
     with pytest.raises(InputError, match="is a run of"):
@@ -327,7 +327,7 @@ def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_pat
 
 def test_run_inside_its_input_is_refused(bench: Bench) -> None:
     inside = replace(bench.settings(), folder=bench.capture / "run")
-    store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
+    store = Store(bench.store, DigestMemo(bench.store / "digests.json"))
     with pytest.raises(InputError, match="is inside the input"):
         Planner(bench.dag, inside, store, 1, bench.remarks).plan()
     at_it = replace(bench.settings(), folder=bench.capture, source=bench.capture)

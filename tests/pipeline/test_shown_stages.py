@@ -23,7 +23,7 @@ def shown(bench: Bench) -> list[str]:
 def reasons(bench: Bench) -> dict[str, tuple[str, ...]]:
     """Return the reasons that `cleargs status` gives for each stage that is not done."""
     run = read_run_file(bench.folder, bench.dag)
-    with DigestMemo(run.store / "digests.sqlite") as memo:
+    with DigestMemo(run.store / "digests.json") as memo:
         plans = Planner(bench.dag, run, Store(run.store, memo), 1, bench.remarks).plan()
         return {plan.stage: plan.reasons for plan in plans if plan.state != "done"}
 

@@ -88,21 +88,21 @@ def test_damage_is_a_miss_with_a_warning(bench: Bench, what: str) -> None:
 @pytest.mark.parametrize("content", [b"", b"no database", b"SQLite format 3\x00" + b"\x07" * 4096])
 def test_damaged_memo_is_replaced(bench: Bench, content: bytes) -> None:
     bench.run()
-    (bench.store / "digests.sqlite").write_bytes(content)
+    (bench.store / "digests.json").write_bytes(content)
     assert [outcome.how for outcome in bench.run()] == ["found"] * 3
     file = bench.root / "file"
     file.write_text("content")
     for known in ("what was noted", file_digest(file)):
-        with DigestMemo(bench.store / "digests.sqlite") as memo:
+        with DigestMemo(bench.store / "digests.json") as memo:
             memo.remember(file, known)
-        with DigestMemo(bench.store / "digests.sqlite") as memo:
+        with DigestMemo(bench.store / "digests.json") as memo:
             assert memo.digest(file) == known, "it works again"
 
 
 def test_wrong_digest_in_the_memo_is_checked(tmp_path: Path, bench: Bench) -> None:
     bench.run()
     folder = (bench.folder / "count").resolve()
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         memo.remember(folder / "log.txt", "0" * 64)
         manifest = read_manifest(folder)
         assert not list(damages(folder, manifest, manifest.files, memo))
@@ -111,7 +111,7 @@ def test_wrong_digest_in_the_memo_is_checked(tmp_path: Path, bench: Bench) -> No
 def test_memo_is_used_only_for_the_same_file(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"one")
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         memo.remember(file, "what was noted")
         assert memo.digest(file) == "what was noted"
         other = tmp_path / "other"
@@ -124,23 +124,23 @@ def test_two_processes_may_use_the_memo_at_once(tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.txt" for number in range(20)]
     for file in files:
         file.write_text(file.name)
-    with DigestMemo(tmp_path / "memo.sqlite") as one, DigestMemo(tmp_path / "memo.sqlite") as two:
+    with DigestMemo(tmp_path / "memo.json") as one, DigestMemo(tmp_path / "memo.json") as two:
         for file in files[:15]:
             one.remember(file, "one")
         for file in files[5:]:
             two.remember(file, "one")
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         assert {memo.digest(file) for file in files} == {"one"}
 
 
 def test_a_forgotten_digest_stays_forgotten(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"one")
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         memo.remember(file, "what was noted")
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         memo.forget(file)
-    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+    with DigestMemo(tmp_path / "memo.json") as memo:
         assert memo.digest(file) == file_digest(file)
 
 
@@ -174,9 +174,9 @@ def test_unwritable_run_folder(bench: Bench, tmp_path: Path) -> None:
 def test_collect_keeps_what_runs_show(bench: Bench) -> None:
     bench.run("square.power=3")
     bench.run()
-    with DigestMemo(bench.store / "digests.sqlite") as memo:
+    with DigestMemo(bench.store / "digests.json") as memo:
         store = Store(bench.store, memo)
-        (bench.store / "work" / "abc" / "checkpoints").mkdir(parents=True)
+        (bench.store / "work" / f"{7:064x}" / "checkpoints").mkdir(parents=True)
         (store.root / "kept" / "square").mkdir(parents=True)
         shown = {(bench.folder / name).resolve() for name in bench.dag.names}
         assert {item.kind for item in store.collect(bench.dag.names, checkpoints=False, dry_run=True)} == {
@@ -227,7 +227,7 @@ def rot(bench: Bench, file: Path) -> None:
     """Change one byte without a trace in any time stamp, as a failing disk does. The memo is not updated."""
     known = file_digest(file)
     flip(file)
-    with DigestMemo(bench.store / "digests.sqlite") as memo:
+    with DigestMemo(bench.store / "digests.json") as memo:
         memo.remember(file, known)
 
 

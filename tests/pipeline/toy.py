@@ -260,13 +260,13 @@ class Bench:
         store: Path | None = None,
     ) -> list[StageOutcome]:
         settings = self.settings(overrides, seed, store)
-        with DigestMemo(settings.store / "digests.sqlite") as memo:
+        with DigestMemo(settings.store / "digests.json") as memo:
             runner = Runner(self.dag, settings, Store(settings.store, memo), threads, self.remarks)
             return runner.run_until(until, force=force, allow_partial=allow_partial)
 
     def plan(self, *overrides: str, seed: int = 0) -> dict[str, StagePlan]:
         settings = self.settings(overrides, seed)
-        with DigestMemo(settings.store / "digests.sqlite") as memo:
+        with DigestMemo(settings.store / "digests.json") as memo:
             planner = Planner(self.dag, settings, Store(settings.store, memo), 1, self.remarks)
             return {plan.stage: plan for plan in planner.plan()}
 

@@ -21,7 +21,7 @@ def batch_page(root: Path) -> Path:
     """The page of three scenes: one done with a report, one waiting without a report, one failed."""
     folder = root / "captures & more.batch"
     attic = FinishedRun(folder / "scenes", "attic")
-    with DigestMemo(root / "digests.sqlite") as memo:
+    with DigestMemo(root / "digests.json") as memo:
         write_report(attic.planner(Store(root, memo)))
     FinishedRun(folder / "scenes", "barn")
     (folder / "logs").mkdir()

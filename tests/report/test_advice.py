@@ -33,7 +33,7 @@ def advice(tmp_path: Path, rows: Any, manifests: Any, *settings: str) -> list[Ad
     """Advice on a run with these settings, whose capture does not exist."""
     config = load_config(installed(), "default", settings)
     run = RunSpec(tmp_path / "run", tmp_path / "clip.mp4", config, tmp_path / "store", "cpu")
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         planner = Planner(installed(), run, Store(tmp_path, memo), 1, SilentReporter())
         return shown_advice(planner, manifests, rows)
 
@@ -102,7 +102,7 @@ def test_printed_commands_run_as_printed(
         cv2.imwrite(str(tmp_path / f"my capture/{k}.png"), image)
     run = replace(finished.run, source=tmp_path / "my capture")
     manifests = linked_manifests(finished.folder, finished.dag.names)
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         planner = Planner(finished.dag, run, Store(tmp_path, memo), 1, SilentReporter())
         found = shown_advice(planner, manifests, load_rows(finished.folder, manifests))
     commands = [shown for shown in found if shown.command]

@@ -78,7 +78,7 @@ class Report(Opened):
 def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     run = FinishedRun(tmp_path_factory.mktemp("browser"))
     (run.folder / ".store").mkdir()
-    with DigestMemo(run.folder / ".store/digests.sqlite") as memo:
+    with DigestMemo(run.folder / ".store/digests.json") as memo:
         write_report(run.planner(Store(run.folder / ".store", memo)))
     return run
 

@@ -72,7 +72,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
 def store(run: FinishedRun) -> Iterator[Store]:
     root = run.folder / ".store"
     root.mkdir()
-    with DigestMemo(root / "digests.sqlite") as memo:
+    with DigestMemo(root / "digests.json") as memo:
         yield Store(root, memo)
 
 
@@ -161,7 +161,7 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
     def outcomes(how: Literal["made", "found"]) -> list[StageOutcome]:
         return [StageOutcome(name, how, manifest, run.folder / name) for name, manifest in manifests.items()]
 
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         planner = run.planner(Store(tmp_path, memo))
         page = write_run_report(planner, outcomes("found"))
         assert page == run.folder / "report/index.html"
@@ -182,7 +182,7 @@ def test_commands_start_with_the_program_as_the_user_called_it(
 ) -> None:
     run = FinishedRun(tmp_path)
     monkeypatch.setenv("CLEARGS_PROGRAM", f"{tmp_path}/.venv/bin/cleargs")
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
     commands = re.findall(r'data-copy="([^"]+)"', text)
     assert len(commands) >= 4 and all(one.startswith(".venv/bin/cleargs r") for one in commands)
@@ -195,7 +195,7 @@ def test_commands_start_with_the_program_as_the_user_called_it(
 def test_an_older_report_gets_a_note(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     assert outdated_report_note(run.folder, run.dag) == "", "there is none"
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         page = write_report(run.planner(Store(tmp_path, memo)))
     assert outdated_report_note(run.folder, run.dag) == ""
     (run.folder / "consolidate/manifest.json").unlink()
@@ -207,7 +207,7 @@ def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     for stage in ("g0", "rivr", "consolidate"):
         shutil.rmtree(run.folder / stage)
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
     assert "No scene is trained yet" in text and is_current(
         run.folder, linked_manifests(run.folder, run.dag.names)
@@ -222,14 +222,14 @@ def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
     write_manifest(
         run.folder / "consolidate", made.model_copy(update={"summary": {**made.summary, "repairs": 0}})
     )
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
     assert "0 repaired." in text
 
 
 def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         for stage in ("rivr", "consolidate"):
             (run.folder / stage / "manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
@@ -300,7 +300,7 @@ def test_each_frame_has_the_psnr_of_its_last_steps(run: FinishedRun) -> None:
 
 def test_held_out_frames_have_a_psnr_too(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path, held_out=(0, 3))
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+    with DigestMemo(tmp_path / "digests.json") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])
     assert all(frame["psnr"] > 5 for frame in data["frames"] if frame["role"] == "held out")

@@ -23,8 +23,9 @@ def reported(root: Path) -> FinishedRun:
     """A run with its report."""
     made = FinishedRun(root)
     store = made.folder / ".store"
-    store.mkdir()
-    with DigestMemo(store / "digests.sqlite") as memo:
+    (store / "locks").mkdir(parents=True)
+    (store / "locks" / "store.lock").touch()
+    with DigestMemo(store / "digests.json") as memo:
         write_report(made.planner(Store(store, memo)))
     return made
 
