@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import sys
 import traceback
 from collections.abc import Sequence
@@ -172,7 +173,10 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             command = context.command_path if context is not None else "cleargs"
             return error.exit_code, _one_line(error.format_message()), f"see {command} --help"
         case _ if _is_out_of_memory(error):
-            return 1, "out of memory", "lower ingest.max_size or ingest.max_frames, or close other programs"
+            limit, remedy = resource.getrlimit(resource.RLIMIT_AS)[0], "close other programs"
+            if limit != resource.RLIM_INFINITY:
+                remedy = f"raise the limit on virtual memory, {limit / 1e9:.1f} GB: ulimit -v unlimited"
+            return 1, "out of memory", f"{remedy}, or lower ingest.max_size or ingest.max_frames"
         case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return 1, "no space left on the disk", "free some space (cleargs gc), or choose another --store"
         case OSError():

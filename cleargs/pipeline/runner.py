@@ -71,6 +71,7 @@ class Runner(Planner):
         for plan in plans:
             if plan.state != "done":
                 self.dag.load(plan.stage).preflight(self.run.config.effective[plan.stage])
+        check_address_space(plans)
         check_disk(plans, self.store.root)
         plans = self.at_measured_pace(plans)
         for line in (*rerun_lines(plans), cost_line(plans)):

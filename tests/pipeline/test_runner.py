@@ -206,9 +206,22 @@ def test_too_little_address_space_is_refused_before_any_work(
 ) -> None:
     """Under ``ulimit -v 700000``, OpenBLAS requested memory in an endless loop."""
     monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (716_800_000, -1))
-    with pytest.raises(InputError, match="virtual memory is 717 MB"):
+    with pytest.raises(InputError, match=r"virtual memory \(ulimit -v\) is 717 MB; 2.0 GB are needed"):
         bench.run()
     assert stages_run(bench) == []
+
+
+def test_the_address_space_of_all_stages_is_checked_before_any_work(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """2.6 GB passed the first check, and g0 failed, with advice about the capture."""
+    bench.run(until="count")
+    bench.work_done()
+    monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (2_600_000_000, -1))
+    with pytest.raises(InputError, match=r"is 2.6 GB; 3.6 GB are needed"):
+        bench.run()
+    assert stages_run(bench) == []
+    assert bench.run(until="count")[0].how == "found", "nothing is to be done"
 
 
 def test_status_names_what_changed(bench: Bench) -> None:
