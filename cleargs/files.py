@@ -119,7 +119,8 @@ def disk_error(error: OSError, path: Path) -> StoreError:
     """Return the StoreError, with a hint, for a failed write of ``path``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StoreError(
-            f"no space left on the disk of {path.parent}", hint="free some space, or choose another --store"
+            f"no space left for data or files on the disk of {path.parent}",  # or no free inode
+            hint="free some space, or choose another --store",
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return StoreError(

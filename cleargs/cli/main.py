@@ -178,7 +178,8 @@ def explanation(error: Exception) -> tuple[int, str, str]:
                 remedy = f"raise the limit on virtual memory, {limit / 1e9:.1f} GB: ulimit -v unlimited"
             return 1, "out of memory", f"{remedy}, or lower ingest.max_size or ingest.max_frames"
         case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return 1, "no space left on the disk", "free some space (cleargs gc), or choose another --store"
+            cause, remedy = "no space left for data or files on the disk", "free some space (cleargs gc)"
+            return 1, cause, f"{remedy}, or choose another --store"
         case OSError():
             cause = f"{error.strerror or _one_line(error)}{f': {error.filename}' if error.filename else ''}"
             if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
@@ -186,7 +187,24 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             return 1, cause, "check the disk and its permissions"
         case _:
             cause = f"unexpected {type(error).__name__}: {_one_line(error)}"
+            if isinstance(error, ValueError) and (names := _variables(error)):
+                cause = f"the environment variable {' or '.join(names)} cannot be used: {_one_line(error)}"
+                return 2, cause, "correct or unset it"
             return 1, cause, "repeat the command with --debug to see the traceback, and please report it"
+
+
+def _variables(error: Exception) -> list[str]:
+    """Return NAME=VALUE of the environment variables that the library which raised ``error`` reads.
+
+    They are named in the line that raised it, or begin with the name of the library (NUMBA_...).
+    """
+    found = []
+    for last in traceback.extract_tb(error.__traceback__)[-1:]:
+        library = last.filename.partition("site-packages/")[2].partition("/")[0].upper()
+        for name in os.environ if library else ():
+            if f"'{name}'" in (last.line or "") or name.startswith(f"{library}_"):
+                found.append(f"{name}={os.environ[name]}")
+    return found
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
