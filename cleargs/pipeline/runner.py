@@ -253,12 +253,14 @@ class Runner(Planner):
             summary=plain_json(result.summary),
             **cost,
         )
-        published = self.store.publish(work, manifest)
+        published = self.store.publish(work, manifest, forced=forced)
         if forced and entry is not None and entry.manifest is not None:
             if entry.manifest.digest == manifest.digest:
                 self.reporter.info(f"{name}: the new results have the same digests as before")
             else:
-                self.reporter.warn(f"{name}: the new results have other digests than before")
+                before, here = (one.versions.get("processor") for one in (entry.manifest, manifest))
+                why = f", which were made on {before}, not {here}" if before and before != here else ""
+                self.reporter.warn(f"{name}: the new results have other digests than before{why}")
         # An equal result that was already there keeps its manifest; the outcome has the cost of this attempt.
         return published.model_copy(update=cost)
 
