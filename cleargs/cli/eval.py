@@ -23,7 +23,7 @@ from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE
-from cleargs.run_results import SCENE, scene_stage
+from cleargs.run_results import scene_path, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
@@ -204,7 +204,7 @@ def _older(run: Path, path: Path) -> Report:
         found = read_report(path).evaluations
     except InputError:
         return Report(evaluations=())  # none yet, or damaged
-    scenes = {evaluation.subject: run / evaluation.subject / SCENE for evaluation in found}
+    scenes = {evaluation.subject: scene_path(run, evaluation.subject) for evaluation in found}
     digests = {subject: file_digest(scene) for subject, scene in scenes.items() if scene.is_file()}
     kept = (evaluation for evaluation in found if evaluation.scene == digests.get(evaluation.subject))
     return Report(evaluations=tuple(kept))
@@ -241,10 +241,10 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
             f"{target} is not a run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
         )
     if "all" in stages:
-        chosen = [name for name in dag.names if (target / name / SCENE).is_file()]
+        chosen = [name for name in dag.names if scene_path(target, name).is_file()]
     else:
         chosen = [scene_stage(dag, target, name) for name in dict.fromkeys(stages)]
-    return {name: target / name / SCENE for name in chosen or [scene_stage(dag, target, None)]}
+    return {name: scene_path(target, name) for name in chosen or [scene_stage(dag, target, None)]}
 
 
 def _print(report: Report, output: Path | None) -> None:

@@ -14,6 +14,7 @@ from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.files import External
 from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
+from cleargs.packed import require_images
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
 from cleargs.pipeline.run_file import RunSpec
@@ -38,8 +39,9 @@ NO_RESULTS = "no results yet"
 Origins = dict[str, dict[str, str]]
 """Input ("STAGE/PATH") or role of an external -> relative path of a file -> its digest."""
 
-State = Literal["done", "partial", "missing"]
-"""``partial``: the results exist, but the stage could not make all of them."""
+State = Literal["done", "partial", "missing", "packed"]
+"""``partial``: the results exist, but the stage could not make all of them. ``packed``: those that
+``cleargs pack`` took exist, and nothing can be run."""
 
 
 @dataclass(frozen=True)
@@ -248,6 +250,7 @@ class Planner:
 
         Raises InputError if an external of any stage cannot be read: better now than after hours of work.
         """
+        require_images(self.run.folder, "continuing it")
         plans: list[StagePlan] = []
         done: dict[str, Manifest] = {}
         for name in self.dag.until(until):

@@ -134,6 +134,11 @@ def read_source(folder: Path) -> Path | None:
         return None
 
 
+def located(folder: Path) -> Path:
+    """Return the absolute path of a run folder, which has a name: ``..`` is followed, and links are kept."""
+    return folder.resolve() if ".." in folder.parts else folder.absolute()
+
+
 def read_run_file(
     folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None
 ) -> RunSpec:
@@ -141,7 +146,7 @@ def read_run_file(
 
     Raises InputError if the folder has no ``run.toml``, and ConfigError if the file is damaged.
     """
-    folder = folder.absolute()
+    folder = located(folder)
     if not (folder / RUN_FILE).is_file():
         raise InputError(
             f"{folder} is not a run: it has no {RUN_FILE}", hint=f"start one: cleargs run INPUT -o {folder}"

@@ -11,6 +11,7 @@ from typing import Literal
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError, listed
 from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
+from cleargs.packed import require_images
 from cleargs.pipeline.config import check_document, known_settings, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
@@ -18,6 +19,7 @@ from cleargs.pipeline.run_file import (
     RunMetadata,
     RunSpec,
     damaged_run_file,
+    located,
     read_metadata,
     read_source,
 )
@@ -113,6 +115,8 @@ def resolve_run(
     ``reporter`` receives messages about the device, and about settings that the run keeps or loses. Raises
     InputError if ``source`` does not exist or is a run, and ConfigError if a setting is unknown or unusable.
     """
+    for place in (folder, source):
+        require_images(place, "continuing it")
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")
     if (source / RUN_FILE).is_file():
@@ -121,7 +125,7 @@ def resolve_run(
             f"{source} is a run, not a capture",
             hint=f"give the capture of this run{f': {made_from}' if made_from else ''}",
         )
-    folder, forgets = folder.absolute(), reset or recipe is not None
+    folder, forgets = located(folder), reset or recipe is not None
     metadata, kept = RunMetadata(), None
     try:
         metadata = read_metadata(folder)

@@ -21,7 +21,7 @@ from cleargs.formation.frames import view_of
 from cleargs.manifest import linked_manifest
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
-from cleargs.run_results import SCENE
+from cleargs.run_results import scene_path
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, write_scene
 from cleargs.splat.ply import read_ply
@@ -67,7 +67,7 @@ def export_scene(
     posed = [frame for frame in load_frames(ingest) if frame.registered]
     cameras = {frame.frame_id: (frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed}
     similarity = _similarity(ingest, cameras, options)
-    scene, messages = read_ply(run / stage / SCENE), []
+    scene, messages = read_ply(scene_path(run, stage)), []
     if thresholds:
         scene, message = prune_scene(scene, thresholds, run, stage, reporter)
         messages.append(message)
