@@ -13,6 +13,7 @@ from cleargs.errors import InputError
 from cleargs.manifest import Manifest, read_manifest
 from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_run_file
 
@@ -185,7 +186,7 @@ class Prepared:
         reads ``transforms.json``. All poses are in normalised coordinates. Held-out frames are included.
 
         Raises:
-            InputError: if the run is packed.
+            InputError: if the folder is in the input, or the run is packed.
             StoreError: if the folder exists or cannot be written.
 
         Example:
@@ -196,7 +197,9 @@ class Prepared:
         from cleargs.files import whole_folder, write_json
 
         target, frames = Path(folder), []
-        require_images(self.folder.parent, "writing them")
+        run = self.folder.parent
+        require_images(run, "writing them")
+        check_outputs([target], installed(), run)
         by_id = {frame.frame_id: frame for frame in self.frames}
         with whole_folder(target) as made:
             shutil.copytree(self.folder / "colmap/sparse/0", made / "sparse/0")
@@ -223,6 +226,7 @@ class Prepared:
         """
         from cleargs.formation.frames import real_views
 
+        require_images(self.folder.parent, "training")
         given = {frame.frame_id: 1.0 for frame in self.frames} if weights is None else weights
         return real_views(self.frames, given, self.folder)
 

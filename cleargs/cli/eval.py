@@ -22,6 +22,7 @@ from cleargs.digest import file_digest
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.run_results import scene_path, scene_stage
 
@@ -161,10 +162,16 @@ def eval(
         EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=steps)
         for steps in dict.fromkeys((0, refine_poses))
     ]
-    from cleargs.evaluate.eval_report import Report, write_report
+    from cleargs.evaluate.eval_report import Report, read_report, write_report
     from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
     from cleargs.evaluate.references import reference_of, views_trained_on
 
+    given = (directory, renders, align, None if run else target)
+    results = [] if output is None else [output, output.with_suffix(".parquet")]
+    written = results if save_renders is None else [*results, save_renders]
+    check_outputs(written, dag, run, inputs=[place for place in given if place is not None])
+    if any(file.exists() for file in results):
+        read_report(results[0])  # only results of this command are replaced
     reporter = make_reporter(quiet)
     reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
     evaluations = []

@@ -15,6 +15,7 @@ from cleargs.errors import InputError
 from cleargs.files import atomic_path
 from cleargs.packed import PACK, Pack, require_images
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, read_run_file
 from cleargs.report.single_file import for_others
 from cleargs.run_results import scene_stage
@@ -51,8 +52,7 @@ def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -
     output = output or Path(f"{name}.zip")
     if output.suffix.lower() != ".zip":
         raise InputError(f"{output} does not end in .zip", hint="name the file NAME.zip")
-    if output.exists() and not force:
-        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+    check_outputs([output], dag, run, force=force)
     stage = scene_stage(dag, run, None)
     files = {file.relative_to(run).as_posix(): file for file in _files(run, dag)}
     results = [name for name in files if name.partition("/")[0] in dag.names]

@@ -25,6 +25,7 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
 from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import StageOutcome
@@ -67,6 +68,10 @@ def report(
         hint = f"cleargs report {quote(str(run))} --single-file -o FILE.html"
         raise InputError("-o needs --single-file", hint=hint)
     target = output or run / f"{run.resolve().name}-report.html"
+    if single_file:
+        if target.suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"{target} does not end in .html", hint="name the file NAME.html")
+        check_outputs([target], dag, run)
     from cleargs.report.page import write_report
     from cleargs.report.single_file import write_single_file
 

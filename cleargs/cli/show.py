@@ -29,6 +29,7 @@ from cleargs.packed import WORKS, read_pack
 from cleargs.parquet import read_any_table, read_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.report.report_json import linked_manifests
 
@@ -109,6 +110,7 @@ def show(
     done = linked_manifests(run, dag.names)
     if frame is not None:
         picture = output or run / f"frame-{frame:06d}.png"
+        check_outputs([picture], dag, run)
         _show_frame(run, done, frame, None if read_pack(run) else picture, as_json)
     elif stage is None:
         if as_json:

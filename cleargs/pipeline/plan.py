@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
 from cleargs.packed import require_images
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
+from cleargs.pipeline.outputs import Place, own_places
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.pipeline.store import Entry, Store, WorkFolder
@@ -135,19 +136,30 @@ class Planner:
     def external_digests(self, name: str, *, rehash: bool = False) -> dict[str, dict[str, str]]:
         """Return role -> relative path -> digest of the files that ``name`` reads outside the store.
 
-        With ``rehash``, every file is read again. Raises InputError if one cannot be read, or if the run is
-        inside the input.
+        With ``rehash``, every file is read again. Raises InputError if one cannot be read, if the run or its
+        store is inside the input, or if the input is one of the files that the run writes.
         """
         places = self._externals(name)
-        hint = "choose a folder next to the input with -o"
         for folder in (self.run.folder, self.run.source, self.store.root):
             require_utf8(folder)
-        if self.run.folder == self.run.source:
-            raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
-        for place in places.values():
-            if isinstance(place, Path) and self.run.folder.is_relative_to(place):
-                raise InputError(f"the run folder {self.run.folder} is inside the input {place}", hint=hint)
+        self._keep_apart(places.values())
         return {role: self.store.memo.digests_of(place, rehash=rehash) for role, place in places.items()}
+
+    def _keep_apart(self, places: Iterable[External]) -> None:
+        """Raise InputError unless the run, its store and the ``places`` of its inputs are apart."""
+        run, source, hint = self.run.folder, self.run.source, "choose a folder next to the input with -o"
+        given = Place(source, hard_links=False)
+        within = Place(run).is_inside(source)
+        if within and given.is_inside(run):
+            raise InputError(f"the run folder {run} is the input itself", hint=hint)
+        folders = [place for place in places if isinstance(place, Path)]
+        for place in folders if within else (*folders, source):
+            for what, folder, option in (("run folder", run, "-o"), ("store", self.store.root, "--store")):
+                if Place(folder).is_inside(place):
+                    hint = f"choose a folder next to the input with {option}"
+                    raise InputError(f"the {what} {folder} is inside the input {place}", hint=hint)
+        for place in filter(given.is_inside, own_places(run, self.dag, self.store.root)):
+            raise InputError(f"the run would replace its input {source}: it writes {place}", hint=hint)
 
     def reasons(self, stage_key: StageKey, entry: Entry | None) -> tuple[str, ...]:
         """Return the reasons why there are no complete results for ``stage_key``, for users."""

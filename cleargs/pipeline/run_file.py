@@ -126,12 +126,12 @@ def read_metadata(folder: Path) -> RunMetadata:
     return RunMetadata(document, paths.get("input"), paths.get("store"), device, tuple(on_cpu), damaged)
 
 
-def read_source(folder: Path) -> Path | None:
-    """Return the capture of the run in ``folder``; None if ``run.toml`` does not say."""
+def known_metadata(folder: Path) -> RunMetadata:
+    """Return the content of ``run.toml`` as `read_metadata` does, or empty metadata if it is not TOML."""
     try:
-        return read_metadata(folder).source
+        return read_metadata(folder)
     except ConfigError:
-        return None
+        return RunMetadata()
 
 
 def located(folder: Path) -> Path:

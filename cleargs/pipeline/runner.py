@@ -39,7 +39,7 @@ from cleargs.pipeline.plan import (
     cost_line,
     rerun_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, read_source, write_run_file
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, known_metadata, write_run_file
 from cleargs.pipeline.store import Entry, Store
 
 
@@ -283,7 +283,7 @@ def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
 
     A capture at another path is the same if its content is equal.
     """
-    before = read_source(run.folder)
+    before = known_metadata(run.folder).source
     if before is None or before == run.source:
         return
     first = dag.names[0]

@@ -19,9 +19,9 @@ from cleargs.pipeline.run_file import (
     RunMetadata,
     RunSpec,
     damaged_run_file,
+    known_metadata,
     located,
     read_metadata,
-    read_source,
 )
 from cleargs.pipeline.store import STORE_FOLDER, Store
 from cleargs.progress import Reporter
@@ -120,7 +120,7 @@ def resolve_run(
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")
     if (source / RUN_FILE).is_file():
-        made_from = read_source(source)
+        made_from = known_metadata(source).source
         raise InputError(
             f"{source} is a run, not a capture",
             hint=f"give the capture of this run{f': {made_from}' if made_from else ''}",

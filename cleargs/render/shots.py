@@ -18,6 +18,8 @@ from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
 from cleargs.packed import require_images
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
 from cleargs.render.output import Kind, Shot, kind_of, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
@@ -100,8 +102,8 @@ def render_run(
     kind = kind_of(output)
     if kind == "folder" and output.parent.exists():  # it may contain other files than stills
         raise InputError(f"{output.parent} exists already", hint="choose a new folder")
-    if kind != "folder" and output.exists() and not force:
-        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+    inputs = () if options.poses is None else (options.poses,)
+    check_outputs([output], installed(), run, inputs=inputs, force=force)
     if options.side_by_side:
         require_images(run, "--side-by-side")
     shots = _shots(run / "ingest", options, kind)

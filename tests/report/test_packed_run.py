@@ -125,6 +125,7 @@ def test_functions_that_need_images_are_refused(packed: Path, tmp_path: Path) ->
         lambda: cg.deblur(run, 3),
         lambda: cg.evaluate_scene(run),
         lambda: cg.open_prepared(run["ingest"]).to_nerfstudio(tmp_path / "n"),
+        lambda: cg.open_prepared(run["ingest"]).views(),
     ):
         with pytest.raises(InputError, match="is a packed run"):
             call()
