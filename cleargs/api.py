@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 from cleargs.api_parts import Progress, reporter_of, save
 from cleargs.errors import InputError
+from cleargs.packed import require_images
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.progress import log_reporter
-from cleargs.run_results import SCENE, Run, open_prepared
+from cleargs.run_results import SCENE, Run, open_prepared, scene_stage
 from cleargs.splat.config import Quality
 
 if TYPE_CHECKING:
@@ -109,10 +110,8 @@ def export(run: Run, *files: str | Path, stage: str | None = None, **options: An
     """
     from cleargs.render.export import ExportOptions, export_scene
 
-    paths = [Path(file) for file in files]
-    return export_scene(
-        run.folder, run.scene_file(stage).parent.name, paths, ExportOptions(**options), log_reporter()
-    )
+    paths, chosen = [Path(file) for file in files], scene_stage(installed(), run.folder, stage)
+    return export_scene(run.folder, chosen, paths, ExportOptions(**options), log_reporter())
 
 
 def film(run: Run, file: str | Path, *, stage: str | None = None, **options: Any) -> Path:
@@ -129,7 +128,8 @@ def film(run: Run, file: str | Path, *, stage: str | None = None, **options: Any
     from cleargs.render.shots import ShotOptions, render_run
 
     path = Path(file)
-    render_run(run.scene_file(stage), path, ShotOptions(**options), log_reporter())
+    chosen = scene_stage(installed(), run.folder, stage)
+    render_run(run.folder, chosen, path, ShotOptions(**options), log_reporter())
     return path
 
 
@@ -167,6 +167,7 @@ def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | 
     from cleargs.formation.frames import view_of
     from cleargs.rivr.distillation import TrainedScene
 
+    require_images(run.folder, "deblurring")
     capture = open_prepared(run["ingest"])
     frame = next((frame for frame in capture.frames if frame.frame_id == frame_id), None)
     if frame is None or not frame.registered:

@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.session import usable_cores
-from cleargs.progress import LineReporter, Reporter, Say, log_reporter
+from cleargs.progress import PREVIEW, LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import Prepared
 from cleargs.splat.budget import resolve_config
 
@@ -103,7 +105,7 @@ def train(
         An object with the trained ``scene`` and a table ``rows`` with one row per step.
 
     Raises:
-        InputError: if no view has a weight above 0.
+        InputError: if no view has a weight above 0, or if ``checkpoint`` is a file of another kind.
 
     Example:
         capture = cg.open_prepared(cg.open_run("run")["ingest"])
@@ -112,9 +114,15 @@ def train(
         print(trained.rows["loss"][-1])
     """
     from cleargs.splat.config import TrainConfig
+    from cleargs.splat.state import load_state
     from cleargs.splat.trainer import Trainer
 
     config = config or TrainConfig()
+    if checkpoint is not None:
+        check_outputs([Path(checkpoint), Path(checkpoint).with_name(PREVIEW)], installed())
+        state = load_state(Path(checkpoint), reporter_of(progress))
+        if Path(checkpoint).exists() and (state is None or "fingerprint" not in state):
+            raise InputError(f"{checkpoint} exists and is not a checkpoint", hint="choose another name")
     with tempfile.TemporaryDirectory() as nowhere:
         if checkpoint is None:  # the interval is longer than any training: no checkpoint is written
             config = config.model_copy(update={"checkpoint_interval": 1_000_000})
@@ -146,13 +154,14 @@ def save(scene: Scene, path: str | Path) -> None:
     """Write a scene in the format that the file ending names: .ply, .compressed.ply, .sog, .spz, .glb, .usdc.
 
     Raises:
-        InputError: for another ending.
+        InputError: for another ending, or for a file of a run.
 
     Example:
         cg.save(cg.open_run("run").scene(), "room.spz")
     """
     from cleargs.splat.formats import format_of, write_scene
 
+    check_outputs([Path(path)], installed())
     write_scene(Path(path), scene, format_of(Path(path)))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -110,8 +111,22 @@ class Manifest(FrozenModel):
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that a manifest stores in addition to those of the libraries in the key."""
-    return {"cleargs": cleargs.__version__, "python": platform.python_version()}
+    """Return what a manifest stores in addition to the versions of the libraries in the key.
+
+    The processor is not in the key, so that machines of several kinds can continue each other's runs.
+    """
+    version, python = cleargs.__version__, platform.python_version()
+    return {"cleargs": version, "python": python, "processor": instruction_set()}
+
+
+def instruction_set(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
+    """Return the level of this machine's x86-64 processor (x86-64-v1 to v4), or the name of another kind."""
+    machine = platform.machine()
+    with suppress(OSError):
+        if machine == "x86_64" and (found := re.search(r"^flags\s*:(.*)", cpuinfo.read_text(), re.MULTILINE)):
+            added = ("sse4_2", "avx2", "avx512bw")  # by levels 2 to 4
+            return f"{machine}-v{1 + sum(name in found[1].split() for name in added)}".replace("_", "-")
+    return machine
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
-from cleargs.manifest import Manifest, has_results, linked_manifest
+from cleargs.manifest import Manifest, has_results
+from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_run_file
 
@@ -26,13 +28,19 @@ if TYPE_CHECKING:
 
 def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
-    done = [name for name in dag.names if (run / name / SCENE).is_file() and has_results(run, name)]
+    done = [name for name in dag.names if scene_path(run, name).is_file() and has_results(run, name)]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:
         return stage
     message = f"{stage} has no scene in {run}" if stage else f"there is no scene in {run}"
     others = f"; the stages with a scene are {', '.join(done)}" if done else ""
     raise InputError(message, hint=f"see cleargs status {run}{others}")
+
+
+def scene_path(run: Path, stage: str) -> Path:
+    """Return the path of the scene of a stage, which need not exist. A packed run has its one at the top."""
+    packed = read_pack(run)
+    return run / SCENE if packed is not None and packed.scene == stage else run / stage / SCENE
 
 
 def open_run(folder: str | Path) -> Run:
@@ -84,7 +92,7 @@ class Run:
 
     def scene_file(self, stage: str | None = None) -> Path:
         """Return the path of the file that `scene` reads. Raises InputError without one."""
-        return self.folder / scene_stage(installed(), self.folder, stage) / SCENE
+        return scene_path(self.folder, scene_stage(installed(), self.folder, stage))
 
 
 @dataclass(frozen=True)
@@ -178,6 +186,7 @@ class Prepared:
         reads ``transforms.json``. All poses are in normalised coordinates. Held-out frames are included.
 
         Raises:
+            InputError: if the folder is in the input, or the run is packed.
             StoreError: if the folder exists or cannot be written.
 
         Example:
@@ -188,6 +197,9 @@ class Prepared:
         from cleargs.files import whole_folder, write_json
 
         target, frames = Path(folder), []
+        run = self.folder.parent
+        require_images(run, "writing them")
+        check_outputs([target], installed(), run)
         by_id = {frame.frame_id: frame for frame in self.frames}
         with whole_folder(target) as made:
             shutil.copytree(self.folder / "colmap/sparse/0", made / "sparse/0")
@@ -214,6 +226,7 @@ class Prepared:
         """
         from cleargs.formation.frames import real_views
 
+        require_images(self.folder.parent, "training")
         given = {frame.frame_id: 1.0 for frame in self.frames} if weights is None else weights
         return real_views(self.frames, given, self.folder)
 

@@ -99,7 +99,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES, *, root: Path | None = No
         size = os.fstat(file.fileno()).st_size
         if size > max_bytes:
             raise OSError(errno.EFBIG, f"it has {size} bytes, the limit is {max_bytes}", str(path))
-        return file.read(max_bytes)
+        return file.read(max(size, 2**20))  # reserves as much memory; files in /proc have size 0
 
 
 def read_text(path: Path) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -50,3 +52,15 @@ def test_an_untrusted_file_is_refused_or_ignored(name: str, what: str, tmp_path:
         assert "\n" not in str(error) and error.hint
     else:
         assert not found
+
+
+def test_reading_reserves_no_more_memory_than_the_file_needs(tmp_path: Path) -> None:
+    """Every read reserved the limit of 4 GiB, so that a run failed with 4 GB of addresses."""
+    (tmp_path / "small").write_text("content")
+    limited = (
+        "import resource; from pathlib import Path; from cleargs.safe_io import read_bytes\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (2**31, 2**31))\n"
+        f"print(read_bytes(Path({str(tmp_path / 'small')!r})).decode(), read_bytes(Path('/proc/stat'))[:3])"
+    )
+    told = subprocess.run([sys.executable, "-c", limited], capture_output=True, text=True, check=False)
+    assert told.stdout == "content b'cpu'\n", told.stderr

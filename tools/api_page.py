@@ -31,7 +31,7 @@ capture = cg.open_prepared(run["ingest"])                    # frames, cameras, 
 image = cg.render_view(scene, capture.cameras()[0]).image    # [H, W, 3]
 
 cg.export(run, "walk.ply", up="z", sh_degree=3)              # for Blender
-cg.film(run, "walk.mp4", seconds=6)                          # along the path of the capture
+cg.film(run, "walk-film.mp4", seconds=6)                     # along the path of the capture
 print(cg.evaluate_scene(run, "room/truth/observed").means)   # against sharp images
 
 gsplat.rasterization(**scene.to_gsplat(), ...)               # other programs: gsplat,

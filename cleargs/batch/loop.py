@@ -28,6 +28,7 @@ from cleargs.errors import CleargsError, InputError, listed
 from cleargs.files import write_bytes
 from cleargs.own_files import refuse_links
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.outputs import Place
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
@@ -123,9 +124,15 @@ class Batch:
         """Raise SheetError if a scene cannot run, so that hours of work do not end in a missing file.
 
         Causes are a missing input, a wrong setting, a missing model, or a run folder of another input. Raises
-        InputError if the folder has content and is not a batch, and StoreError if a part of it is a link.
+        InputError if the folder has content and is not a batch, or if the batch would replace its sheet, a
+        recipe or a capture, and StoreError if a part of the folder is a link.
         """
         self._check_folder()
+        written = [self.folder / name for name in ("summary.csv", "report", "logs", "exports", "store")]
+        for place in (sheet, *(Path(text) for job in self.scenes for text in (job.source, job.recipe))):
+            for taken in filter(Place(place, hard_links=False).is_inside, written):
+                hint = "choose another folder with -o"
+                raise InputError(f"the batch would replace {place}: it writes {taken}", hint=hint)
         problems = []
         for scene in self.scenes:
             try:
@@ -166,7 +173,7 @@ class Batch:
     def run(self, scene: SceneJob, reporter: Reporter) -> None:
         """Run ``scene`` and the work after it, each in a separate process. Write their output to `log`."""
         self.log(scene).parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(self.log(scene), b"")
+        write_bytes(self.log(scene), b"")  # replaces a link, and does not write through it
         if self._call(scene, self.arguments(scene), reporter) == 0:
             for arguments in self.arguments_after(scene):
                 self.exports.mkdir(exist_ok=True)

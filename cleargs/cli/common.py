@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args
 import click
 
 from cleargs.cli.commands import as_called
-from cleargs.cli.progress_bars import LOG, VERBOSE, LineFile
+from cleargs.cli.progress_bars import LOG, VERBOSE, LineFile, check_log
 from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import recipe_names
@@ -102,6 +102,8 @@ def kept_log(context: click.Context, path: Path, *, writes: bool) -> Iterator[Sa
     Yields a function for details, which the terminal shows only with ``-v``.
     """
     chosen: Say | None = context.meta.get(LOG)
+    if isinstance(chosen, LineFile):
+        check_log(chosen.path, context)
     file = LineFile(path, needed=RUN_FILE)  # nothing is written into a folder that is not a run
 
     def log(text: str) -> None:

@@ -17,6 +17,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.run import run
+from cleargs.errors import InputError
 
 
 @click.command()
@@ -39,6 +40,8 @@ def demo(
     place = folder or Path("demo")
     capture = place / "capture"
     if not (capture / "transforms.json").is_file():
+        if place.is_dir() and any(place.iterdir()):  # it may be a capture of the user
+            raise InputError(f"{place} is not empty, and holds no demo", hint="choose a new folder with -o")
         reporter = make_reporter(options["quiet"])
         place.mkdir(parents=True, exist_ok=True)
         make_capture(capture, "mixed", frames=16, width=480, height=270, seed=0, reporter=reporter)

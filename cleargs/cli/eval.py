@@ -23,8 +23,9 @@ from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.manifest import has_results
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE, check_links
-from cleargs.run_results import SCENE, scene_stage
+from cleargs.run_results import scene_path, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
@@ -162,10 +163,16 @@ def eval(
         EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=steps)
         for steps in dict.fromkeys((0, refine_poses))
     ]
-    from cleargs.evaluate.eval_report import Report, write_report
+    from cleargs.evaluate.eval_report import Report, read_report, write_report
     from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
     from cleargs.evaluate.references import reference_of, views_trained_on
 
+    given = (directory, renders, align, None if run else target)
+    results = [] if output is None else [output, output.with_suffix(".parquet")]
+    written = results if save_renders is None else [*results, save_renders]
+    check_outputs(written, dag, run, inputs=[place for place in given if place is not None])
+    if any(file.exists() for file in results):
+        read_report(results[0])  # only results of this command are replaced
     reporter = make_reporter(quiet)
     reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
     evaluations = []
@@ -205,7 +212,7 @@ def _older(run: Path, path: Path) -> Report:
         found = read_report(path).evaluations
     except InputError:
         return Report(evaluations=())  # none yet, or damaged
-    scenes = {evaluation.subject: run / evaluation.subject / SCENE for evaluation in found}
+    scenes = {evaluation.subject: scene_path(run, evaluation.subject) for evaluation in found}
     digests = {subject: file_digest(scene) for subject, scene in scenes.items() if scene.is_file()}
     kept = (evaluation for evaluation in found if evaluation.scene == digests.get(evaluation.subject))
     return Report(evaluations=tuple(kept))
@@ -244,11 +251,11 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
     check_links(target)
     if "all" in stages:
         chosen = [
-            name for name in dag.names if has_results(target, name) and (target / name / SCENE).is_file()
+            name for name in dag.names if has_results(target, name) and scene_path(target, name).is_file()
         ]
     else:
         chosen = [scene_stage(dag, target, name) for name in dict.fromkeys(stages)]
-    return {name: target / name / SCENE for name in chosen or [scene_stage(dag, target, None)]}
+    return {name: scene_path(target, name) for name in chosen or [scene_stage(dag, target, None)]}
 
 
 def _print(report: Report, output: Path | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import sys
 import traceback
 from collections.abc import Sequence
@@ -173,7 +174,10 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             command = context.command_path if context is not None else "cleargs"
             return error.exit_code, _one_line(error.format_message()), f"see {command} --help"
         case _ if _is_out_of_memory(error):
-            return 1, "out of memory", "lower ingest.max_size or ingest.max_frames, or close other programs"
+            limit, remedy = resource.getrlimit(resource.RLIMIT_AS)[0], "close other programs"
+            if limit != resource.RLIM_INFINITY:
+                remedy = f"raise the limit on virtual memory, {limit / 1e9:.1f} GB: ulimit -v unlimited"
+            return 1, "out of memory", f"{remedy}, or lower ingest.max_size or ingest.max_frames"
         case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
             full = no_space(Path(error.filename or ".").absolute().parent)
             return 1, str(full), full.hint
@@ -182,24 +186,26 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
                 return 2, cause, "choose another path"
             return 1, cause, "check the disk and its permissions"
-        case _ if variables := _variables(error):
-            return 2, f"the environment variable {variables} cannot be used: {_one_line(error)}", "unset it"
         case _:
             cause = f"unexpected {type(error).__name__}: {_one_line(error)}"
+            if isinstance(error, ValueError) and (names := _variables(error)):
+                cause = f"the environment variable {' or '.join(names)} cannot be used: {_one_line(error)}"
+                return 2, cause, "correct or unset it"
             return 1, cause, "repeat the command with --debug to see the traceback, and please report it"
 
 
-def _variables(error: Exception) -> str:
-    """Return the environment variables that made a library raise ``error``; "" if none did.
+def _variables(error: Exception) -> list[str]:
+    """Return NAME=VALUE of the environment variables that the library which raised ``error`` reads.
 
-    They are those that the source of the failed lines names, and the library's own if its import failed.
+    They are named in the line that raised it, or begin with the name of the library (NUMBA_...).
     """
-    frames = traceback.extract_tb(error.__traceback__)
-    _, _, inside = (frames[-1].filename if frames else "").rpartition("/site-packages/")
-    if "<module>" not in [frame.name for frame in frames] or not inside:
-        return ""
-    text, own = " ".join(frame.line or "" for frame in frames), f"{inside.partition('/')[0].upper()}_"
-    return ", ".join(sorted(name for name in os.environ if f"'{name}'" in text or name.startswith(own)))
+    found = []
+    for last in traceback.extract_tb(error.__traceback__)[-1:]:
+        library = last.filename.partition("site-packages/")[2].partition("/")[0].upper()
+        for name in os.environ if library else ():
+            if f"'{name}'" in (last.line or "") or name.startswith(f"{library}_"):
+                found.append(f"{name}={os.environ[name]}")
+    return found
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import zipfile
 from collections.abc import Iterator
@@ -13,7 +14,9 @@ from cleargs.cli.common import FILE, answer, json_option, run_argument
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
 from cleargs.own_files import regular_files
+from cleargs.packed import PACK, Pack, require_images
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import EVAL, RUN_FILE, SCENE, read_run_file
 from cleargs.report.report_json import ENTRY, FOLDER, linked_manifests
 from cleargs.report.single_file import for_others
@@ -45,22 +48,29 @@ def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -
     These are the report, the last scene, the poses and the tables. The images, the earlier scenes and the
     candidates of repairs are left out, so a packed run cannot be continued.
     """
-    name = read_run_file(run, dag).folder.name
+    read_run_file(run, dag)
+    require_images(run, "packing it again")
+    name = run.resolve().name or "run"
     output = output or Path(f"{name}.zip")
     if output.suffix.lower() != ".zip":
         raise InputError(f"{output} does not end in .zip", hint="name the file NAME.zip")
-    if output.exists() and not force:
-        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
-    scene = run / scene_stage(dag, run, None) / SCENE
-    files = {file.relative_to(run).as_posix(): file for file in (scene, *_files(run, dag))}
+    check_outputs([output], dag, run, force=force)
+    stage = scene_stage(dag, run, None)
+    files = {file.relative_to(run).as_posix(): file for file in _files(run, dag)}
+    results = [name for name in files if name.partition("/")[0] in dag.names]
+    packed = Pack(scene=stage, files=(f"{stage}/{SCENE}", *sorted(results)))
+    files |= {SCENE: run / stage / SCENE, PACK: run / RUN_FILE}  # PACK has the date of the settings
     with atomic_path(output) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for inside, file in sorted(files.items()):
             content = file.read_bytes()
-            if inside == RUN_FILE:
+            if inside == PACK:
+                content = json.dumps(packed.model_dump(), indent=2).encode()
+            elif inside == RUN_FILE:
                 content = MADE_OF_NAMES.sub(r"\1\2", content.decode()).encode()
             elif inside.endswith(".html"):
-                content = for_others(content.decode(), run.resolve()).encode()
-            entry = zipfile.ZipInfo(f"{name}/{inside}")  # with a fixed date: equal runs give equal packs
+                page = for_others(content.decode(), run.resolve())
+                content = page.replace(f"../{stage}/{SCENE}", f"../{SCENE}").encode()
+            entry = zipfile.ZipInfo.from_file(file, f"{name}/{inside}", strict_timestamps=False)
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
     size = output.stat().st_size

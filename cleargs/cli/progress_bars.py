@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,11 +15,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cleargs.cli.commands import as_called
+from cleargs.errors import InputError
 from cleargs.files import disk_errors
 from cleargs.own_files import append_own
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.progress import CountedTask, ForwardingTask, LineReporter, Reporter, Say, Task
-from cleargs.safe_io import printable
+from cleargs.safe_io import open_regular, printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -39,6 +42,8 @@ def make_reporter(quiet: bool = False) -> Reporter:
     context = click.get_current_context(silent=True)
     chosen = {} if context is None else context.meta
     progress, log = chosen.get(PROGRESS, "auto"), chosen.get(LOG)
+    if context is not None and isinstance(log, LineFile):
+        check_log(log.path, context)
 
     def echo(text: str) -> None:
         click.echo(printable(as_called(text)), err=True)
@@ -51,6 +56,17 @@ def make_reporter(quiet: bool = False) -> Reporter:
     else:
         shown = LineReporter(say, lambda text: echo(f"warning: {text}"), say)
     return shown if log is None else LoggingReporter(shown, log)
+
+
+def check_log(path: Path, context: click.Context) -> None:
+    """Raise InputError if ``path`` is an input of the running command or of its run, or no log at all."""
+    given = {name: value for name, value in context.params.items() if isinstance(value, Path)}
+    run = next((place for place in given.values() if (place / RUN_FILE).is_file()), None)
+    inputs = [given[name] for name in ("source", "sheet", "target", "directory", "renders") if name in given]
+    check_outputs([path], context.obj, run, inputs=[place for place in inputs if place != run])
+    with suppress(OSError), open_regular(path) as file:  # there is none yet, or it is a device
+        if (begin := file.read(30).lstrip()) and not re.match(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", begin):
+            raise InputError(f"{path} exists, and is not a log of ClearGS", hint="choose another name")
 
 
 class LineFile:

@@ -21,7 +21,7 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device
 from cleargs.report.formatting import count as count_of
-from cleargs.run_results import SCENE, scene_stage
+from cleargs.run_results import scene_stage
 
 
 @click.command(
@@ -119,7 +119,7 @@ def render(
     reporter = make_reporter(quiet)
     on = resolve_device(device, reporter.info)
     set_threads(threads)
-    shots = render_run(run / stage / SCENE, output, given, reporter, force=force, device=on)
+    shots = render_run(run, stage, output, given, reporter, force=force, device=on)
     camera = shots[0].camera
     width = camera.width * (2 if given.side_by_side else 1)
     facts = {"file": str(output), "stage": stage, "pictures": len(shots)}

@@ -23,7 +23,9 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
+from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import StageOutcome
@@ -65,17 +67,26 @@ def report(
     if output is not None and not single_file:
         hint = f"cleargs report {quote(str(run))} --single-file -o FILE.html"
         raise InputError("-o needs --single-file", hint=hint)
+    target = output or run / f"{run.resolve().name}-report.html"
+    if single_file:
+        if target.suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"{target} does not end in .html", hint="name the file NAME.html")
+        check_outputs([target], dag, run)
     from cleargs.report.page import write_report
     from cleargs.report.single_file import write_single_file
 
     settings = read_run_file(run, dag, store=store)
-    with opened_store(settings.store) as opened:
-        page = write_report(Planner(dag, settings, opened, threads, make_reporter(quiet)))
+    page = page_of(settings.folder)
+    if read_pack(run) and page.is_file():
+        click.echo("note: this is the report as it was packed; without images no other is possible", err=True)
+    else:
+        require_images(run, "a report")
+        with opened_store(settings.store) as opened:
+            write_report(Planner(dag, settings, opened, threads, make_reporter(quiet)))
     address = (settings.folder / ENTRY).as_uri()
     facts: dict[str, Any] = {"report": str(page)}
     lines = [f"report: {address}"]
     if single_file:
-        target = output or run / f"{run.resolve().name}-report.html"
         size = write_single_file(page, target)
         facts |= {"single_file": str(target), "bytes": size}
         lines = [f"written: {target} ({size / 1e6:.1f} MB)"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
@@ -38,6 +39,7 @@ from cleargs.cli.common import (
 from cleargs.cli.progress_bars import LOG, make_reporter
 from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.errors import StageError
+from cleargs.packed import WORKS, read_pack
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_text
@@ -47,7 +49,7 @@ from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store,
 from cleargs.pipeline.settings import flattened
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import duration
-from cleargs.report.report_json import ENTRY
+from cleargs.report.report_json import ENTRY, linked_manifests
 from cleargs.safe_io import printable
 
 Summaries = Mapping[str, Mapping[str, Any]]
@@ -259,6 +261,7 @@ States:
   done     all results exist
   partial  some results are missing; the next run retries them
   missing  no results for the current settings and inputs; the line shows what changed
+  packed   results in a run of `cleargs pack`, which cannot be continued
 """
 )
 @run_argument
@@ -268,6 +271,13 @@ States:
 def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
     """Show for each stage of RUN if it is done, partial or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
+    if packed := read_pack(settings.folder):
+        kept = Counter(file.partition("/")[0] for file in packed.files)
+        found = linked_manifests(settings.folder, dag.names).items()
+        why = {name: f"{kept[name]} of {len(manifest.files) + 1} files" for name, manifest in found}
+        print_plans([StagePlan(name, "packed", (text,)) for name, text in why.items()], as_json)
+        click.echo(f"packed run: {WORKS}", err=as_json)
+        return
     with opened_store(settings.store) as opened:
         print_plans(Planner(dag, settings, opened, usable_cores(), make_reporter()).plan(), as_json)
 

@@ -25,9 +25,11 @@ from cleargs.cli.common import (
 from cleargs.cli.frame_rows import frame_rows, reason, short_name
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
+from cleargs.packed import WORKS, read_pack
 from cleargs.parquet import read_any_table, read_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.report.report_json import linked_manifests
 
@@ -107,7 +109,9 @@ def show(
     settings = read_run_file(run, dag)
     done = linked_manifests(run, dag.names)
     if frame is not None:
-        _show_frame(run, done, frame, output or run / f"frame-{frame:06d}.png", as_json)
+        picture = output or run / f"frame-{frame:06d}.png"
+        check_outputs([picture], dag, run)
+        _show_frame(run, done, frame, None if read_pack(run) else picture, as_json)
     elif stage is None:
         if as_json:
             print_json({name: manifest_json(done[name]) if name in done else None for name in dag.names})
@@ -132,7 +136,9 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
         text = ", ".join(f"{label} {value}" for label, value in labelled(chosen))
         rows.append([name, manifest.status, *cells, text])
     _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
-    if None in manifests.values():
+    if read_pack(run.folder):
+        click.echo(f"packed run: {WORKS}")
+    elif None in manifests.values():
         click.echo(as_called(f"not done: see cleargs status {quote(str(run.folder))}"))
     if work := running_stage(run.folder, run.store):
         count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
@@ -219,8 +225,10 @@ def text_of(value: Any) -> str:
     return str(value)
 
 
-def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: Path, as_json: bool) -> None:
-    """Write a picture of a frame's layers, and print all facts about it, as lines or as JSON.
+def _show_frame(
+    run: Path, done: Mapping[str, Manifest], number: int, picture: Path | None, as_json: bool
+) -> None:
+    """Write a picture of a frame's layers unless it is None, and print all facts about it (lines or JSON).
 
     Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
@@ -247,12 +255,12 @@ def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: P
         "formation": {name: {"value": value, "meaning": MEANINGS.get(name, "")} for name, value in formation},
         "rounds": [asdict(found) for found in row.rounds],
         "distilled": next((line for line in repairs if line["frame_id"] == number), None),
-        "layers": _write_layers(picture, run, done, row),
-        "picture": str(picture),
+        "layers": [] if picture is None else _write_layers(picture, run, done, row),
+        "picture": None if picture is None else str(picture),
     }
     if not as_json:
         _print_table(_lines(row, facts), title=f"frame {number}")
-    answer(as_json, facts, f"written: {picture}")
+    answer(as_json, facts, f"written: {picture}" if picture else "no picture: a packed run has no images")
 
 
 def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow) -> list[str]:

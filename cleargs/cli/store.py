@@ -13,10 +13,11 @@ from cleargs.cli.common import FOLDER, answer, json_option, run_argument, store_
 from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.files import remove
-from cleargs.manifest import Manifest, damages, has_results, read_manifest
+from cleargs.manifest import MANIFEST, Manifest, damages, has_results, read_manifest
 from cleargs.own_files import leftovers, size_of
+from cleargs.packed import read_pack
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import RunSpec, read_run_file
+from cleargs.pipeline.run_file import SCENE, RunSpec, read_run_file
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.store import ROOTS, Garbage, Store
 from cleargs.report.formatting import count
@@ -49,11 +50,12 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
     settings = read_run_file(run, dag, store=store)
     faults: list[StoreFault] = []
     stages: list[str] = []
-    files = 0
+    files, left_out, packed = 0, 0, read_pack(settings.folder)
     with opened_store(settings.store) as opened:
         for name in dag.names:
             folder = settings.folder / name
-            if not folder.is_symlink() and not folder.exists():
+            listed = packed is not None and f"{name}/{MANIFEST}" in packed.files
+            if not listed and not folder.is_symlink() and not folder.exists():
                 continue  # no results yet; a copy of a run has folders instead of links
             stages.append(name)
             try:
@@ -63,24 +65,30 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
                     )
                 manifest = read_manifest(folder)
             except (OSError, ValueError) as error:
-                text = "it is no longer in the store" if isinstance(error, OSError) else str(error)
+                gone = f"{MANIFEST} is missing" if listed else "it is no longer in the store"
+                text = gone if isinstance(error, OSError) else str(error)
                 faults.append(StoreFault("damaged", name, text))
                 continue
-            files += len(manifest.files)
-            lines = damages(folder.resolve(), manifest, manifest.files, opened.memo, rehash=True)
-            faults += [StoreFault("damaged", name, line) for line in lines]
-            faults += _changed_inputs(dag, settings, opened, manifest)
+            there = [x for x in manifest.files if packed is None or f"{name}/{x}" in packed.files]
+            files, left_out = files + len(there), left_out + len(manifest.files) - len(there)
+            top = [SCENE] if packed is not None and packed.scene == name else []
+            for place, names in ((folder.resolve(), set(there) - set(top)), (settings.folder, top)):
+                lines = damages(place, manifest, sorted(names), opened.memo, rehash=True)
+                faults += [StoreFault("damaged", name, line) for line in lines]
+            faults += _changed_inputs(dag, settings, opened, manifest) if packed is None else ()
     if not stages:
         raise InputError(f"{run} has no results yet", hint=f"first: cleargs run {settings.source} -o {run}")
     found = count(len(faults), "fault") if faults else "all unchanged"
     answer(
         as_json,
-        {"stages": stages, "files": files, "faults": [fault._asdict() for fault in faults]},
+        {"stages": stages, "files": files, "left_out": left_out, "faults": [x._asdict() for x in faults]},
         *(f"{kind:<8} {stage:<12} {text}" for kind, stage, text in faults),
         f"{files} files of {len(stages)} stages read: {found}",
+        *([f"packed run: {left_out} other files were left out when it was packed"] if packed else []),
     )
     if any(fault.kind == "damaged" for fault in faults):
-        click.echo(f"hint: replace damaged results with `cleargs run {settings.source} -o {run}`", err=True)
+        remedy = f"replace damaged results with `cleargs run {settings.source} -o {run}`"
+        click.echo(f"hint: {'unpack the ZIP file again' if packed else remedy}", err=True)
     return 1 if faults else 0
 
 

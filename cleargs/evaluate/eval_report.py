@@ -204,7 +204,7 @@ def read_report(path: Path) -> Report:
         return Report.model_validate_json(read_bytes(path, root=path.parent))
     except (OSError, ValidationError) as error:
         raise InputError(
-            f"cannot read {path}: {str(error).splitlines()[0]}", hint="make it again with `cleargs eval`"
+            f"cannot read {path}: {str(error).splitlines()[0]}", hint="choose another file of `cleargs eval`"
         ) from error
 
 

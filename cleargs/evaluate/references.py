@@ -31,6 +31,7 @@ from cleargs.formation.motion import FrameMotion
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
+from cleargs.packed import require_images
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.types import ArrayF64, ImageU8, MaskBool
@@ -118,6 +119,7 @@ def reference_of(
         )
     frames = load_frames(ingest)
     if directory is None:
+        require_images(run, "a comparison with held-out frames")
         found = _held_out(ingest, frames)
     else:
         listed = _listed(directory)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,8 +14,10 @@ from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.files import External
 from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
+from cleargs.packed import require_images
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
+from cleargs.pipeline.outputs import Place, own_places
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.pipeline.store import Entry, Store, WorkFolder
@@ -23,7 +25,11 @@ from cleargs.progress import Reporter
 from cleargs.safe_io import require_utf8
 
 MIN_ADDRESS_SPACE_GB = 2.0
-"""Address space that the libraries reserve when they are imported."""
+"""Address space that planning needs, because the libraries reserve it when they are imported."""
+
+MORE_ADDRESS_SPACE_GB = 3.5
+"""Address space that a run needs in addition to the estimated memory, for libraries and stacks of threads.
+Measured with 12 frames of 240x136 (estimate 1.1 GB): a limit of 4.0 GB is too low, and 4.5 GB are enough."""
 
 WORTH_MEASURING_MIN = 2.0
 """Expected work, in minutes, from which measuring the speed of this machine is worth its seconds."""
@@ -34,8 +40,9 @@ NO_RESULTS = "no results yet"
 Origins = dict[str, dict[str, str]]
 """Input ("STAGE/PATH") or role of an external -> relative path of a file -> its digest."""
 
-State = Literal["done", "partial", "missing"]
-"""``partial``: the results exist, but the stage could not make all of them."""
+State = Literal["done", "partial", "missing", "packed"]
+"""``partial``: the results exist, but the stage could not make all of them. ``packed``: those that
+``cleargs pack`` took exist, and nothing can be run."""
 
 
 @dataclass(frozen=True)
@@ -129,19 +136,30 @@ class Planner:
     def external_digests(self, name: str, *, rehash: bool = False) -> dict[str, dict[str, str]]:
         """Return role -> relative path -> digest of the files that ``name`` reads outside the store.
 
-        With ``rehash``, every file is read again. Raises InputError if one cannot be read, or if the run is
-        inside the input.
+        With ``rehash``, every file is read again. Raises InputError if one cannot be read, if the run or its
+        store is inside the input, or if the input is one of the files that the run writes.
         """
         places = self._externals(name)
-        hint = "choose a folder next to the input with -o"
         for folder in (self.run.folder, self.run.source, self.store.root):
             require_utf8(folder)
-        if self.run.folder == self.run.source:
-            raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
-        for place in places.values():
-            if isinstance(place, Path) and self.run.folder.is_relative_to(place):
-                raise InputError(f"the run folder {self.run.folder} is inside the input {place}", hint=hint)
+        self._keep_apart(places.values())
         return {role: self.store.memo.digests_of(place, rehash=rehash) for role, place in places.items()}
+
+    def _keep_apart(self, places: Iterable[External]) -> None:
+        """Raise InputError unless the run, its store and the ``places`` of its inputs are apart."""
+        run, source, hint = self.run.folder, self.run.source, "choose a folder next to the input with -o"
+        given = Place(source, hard_links=False)
+        within = Place(run).is_inside(source)
+        if within and given.is_inside(run):
+            raise InputError(f"the run folder {run} is the input itself", hint=hint)
+        folders = [place for place in places if isinstance(place, Path)]
+        for place in folders if within else (*folders, source):
+            for what, folder, option in (("run folder", run, "-o"), ("store", self.store.root, "--store")):
+                if Place(folder).is_inside(place):
+                    hint = f"choose a folder next to the input with {option}"
+                    raise InputError(f"the {what} {folder} is inside the input {place}", hint=hint)
+        for place in filter(given.is_inside, own_places(run, self.dag, self.store.root)):
+            raise InputError(f"the run would replace its input {source}: it writes {place}", hint=hint)
 
     def reasons(self, stage_key: StageKey, entry: Entry | None) -> tuple[str, ...]:
         """Return the reasons why there are no complete results for ``stage_key``, for users."""
@@ -244,6 +262,7 @@ class Planner:
 
         Raises InputError if an external of any stage cannot be read: better now than after hours of work.
         """
+        require_images(self.run.folder, "continuing it")
         plans: list[StagePlan] = []
         done: dict[str, Manifest] = {}
         for name in self.dag.until(until):
@@ -322,16 +341,17 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
         )
 
 
-def check_address_space() -> None:
-    """Raise InputError if the limit on address space (``ulimit -v``) is too low to import the libraries.
+def check_address_space(plans: list[StagePlan] | None = None) -> None:
+    """Raise InputError if the limit on address space (``ulimit -v``) is too low for the stages to run.
 
-    Some of them would hang.
+    Without ``plans``, it must be enough to import the libraries, some of which would hang.
     """
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_GB * 1e9:
+    costs = [plan.estimate.memory_gb for plan in plans or () if plan.estimate is not None]
+    needed = MORE_ADDRESS_SPACE_GB + max(costs) if costs else MIN_ADDRESS_SPACE_GB
+    if limit != resource.RLIM_INFINITY and limit < needed * 1e9:
         raise InputError(
-            f"the limit on virtual memory is {_size(limit / 1e9)}; ClearGS needs at least "
-            f"{MIN_ADDRESS_SPACE_GB:.0f} GB",
+            f"the limit on virtual memory (ulimit -v) is {_size(limit / 1e9)}; {_size(needed)} are needed",
             hint="raise the limit: ulimit -v unlimited",
         )
 

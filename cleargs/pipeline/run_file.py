@@ -152,12 +152,17 @@ def read_metadata(folder: Path) -> RunMetadata:
     return RunMetadata(document, paths.get("input"), paths.get("store"), device, tuple(on_cpu), damaged)
 
 
-def read_source(folder: Path) -> Path | None:
-    """Return the capture of the run in ``folder``; None if ``run.toml`` does not say."""
+def known_metadata(folder: Path) -> RunMetadata:
+    """Return the content of ``run.toml`` as `read_metadata` does, or empty metadata if it is not TOML."""
     try:
-        return read_metadata(folder).source
+        return read_metadata(folder)
     except ConfigError:
-        return None
+        return RunMetadata()
+
+
+def located(folder: Path) -> Path:
+    """Return the absolute path of a run folder, which has a name: ``..`` is followed, and links are kept."""
+    return folder.resolve() if ".." in folder.parts else folder.absolute()
 
 
 def read_run_file(
@@ -167,7 +172,7 @@ def read_run_file(
 
     Raises InputError if the folder has no ``run.toml``, and ConfigError if the file is damaged.
     """
-    folder = folder.absolute()
+    folder = located(folder)
     if not (folder / RUN_FILE).is_file():
         raise InputError(
             f"{folder} is not a run: it has no {RUN_FILE}", hint=f"start one: cleargs run INPUT -o {folder}"

@@ -41,7 +41,7 @@ from cleargs.pipeline.plan import (
     cost_line,
     rerun_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, read_source, write_run_file
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, known_metadata, write_run_file
 from cleargs.pipeline.store import Entry, Store
 
 
@@ -73,6 +73,7 @@ class Runner(Planner):
         for plan in plans:
             if plan.state != "done":
                 self.dag.load(plan.stage).preflight(self.run.config.effective[plan.stage])
+        check_address_space(plans)
         check_disk(plans, self.store.root)
         plans = self.at_measured_pace(plans)
         for line in (*rerun_lines(plans), cost_line(plans)):
@@ -262,12 +263,14 @@ class Runner(Planner):
             summary=plain_json(result.summary),
             **cost,
         )
-        published = self.store.publish(work, manifest)
+        published = self.store.publish(work, manifest, forced=forced)
         if forced and entry is not None and entry.manifest is not None:
             if entry.manifest.digest == manifest.digest:
                 self.reporter.info(f"{name}: the new results have the same digests as before")
             else:
-                self.reporter.warn(f"{name}: the new results have other digests than before")
+                before, here = (one.versions.get("processor") for one in (entry.manifest, manifest))
+                why = f", which were made on {before}, not {here}" if before and before != here else ""
+                self.reporter.warn(f"{name}: the new results have other digests than before{why}")
         # An equal result that was already there keeps its manifest; the outcome has the cost of this attempt.
         return published.model_copy(update=cost)
 
@@ -290,7 +293,7 @@ def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
 
     A capture at another path is the same if its content is equal.
     """
-    before = read_source(run.folder)
+    before = known_metadata(run.folder).source
     if before is None or before == run.source:
         return
     first = dag.names[0]

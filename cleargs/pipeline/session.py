@@ -11,6 +11,7 @@ from typing import Literal
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError, listed
 from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
+from cleargs.packed import require_images
 from cleargs.pipeline.config import check_document, known_settings, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
@@ -19,8 +20,9 @@ from cleargs.pipeline.run_file import (
     RunSpec,
     checked_store,
     damaged_run_file,
+    known_metadata,
+    located,
     read_metadata,
-    read_source,
 )
 from cleargs.pipeline.store import MEMO, STORE_FOLDER, Store, check_store, is_store, visible_names
 from cleargs.progress import Reporter
@@ -118,15 +120,17 @@ def resolve_run(
     ``reporter`` receives messages about the device, and about settings that the run keeps or loses. Raises
     InputError if ``source`` does not exist or is a run, and ConfigError if a setting is unknown or unusable.
     """
+    for place in (folder, source):
+        require_images(place, "continuing it")
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")
     if (source / RUN_FILE).is_file():
-        made_from = read_source(source)
+        made_from = known_metadata(source).source
         raise InputError(
             f"{source} is a run, not a capture",
             hint=f"give the capture of this run{f': {made_from}' if made_from else ''}",
         )
-    folder, forgets = folder.absolute(), reset or recipe is not None
+    folder, forgets = located(folder), reset or recipe is not None
     is_run = (folder / RUN_FILE).is_file() or is_store(folder / STORE_FOLDER)
     if not is_run and folder != source.absolute() and (names := visible_names(folder)):
         raise InputError(

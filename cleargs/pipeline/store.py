@@ -212,11 +212,12 @@ class Store:
                     file.unlink()
         return work
 
-    def publish(self, work: WorkFolder, manifest: Manifest) -> Manifest:
+    def publish(self, work: WorkFolder, manifest: Manifest, *, forced: bool = False) -> Manifest:
         """Move the outputs of ``work`` to their final folder, atomically and durably. Return the manifest.
 
-        Complete results with equal content that are already there are kept, and the outputs of ``work`` are
-        dropped. Partial, damaged or different ones are replaced.
+        Complete results that another process published in the meantime are kept, and the outputs of ``work``
+        are dropped, also if they differ: another kind of processor gives other bits, and runs may already
+        build on its results. Partial or damaged ones are replaced, and with ``forced`` different ones too.
         """
         final = self.folder(manifest.stage, manifest.key)
         with disk_errors(final):
@@ -225,9 +226,10 @@ class Store:
             final.parent.mkdir(parents=True, exist_ok=True)
             existing = self.find(manifest.stage, manifest.key)
             if existing is not None:
-                if existing.complete is not None and existing.complete.digest == manifest.digest:
+                kept = existing.complete
+                if kept is not None and (not forced or kept.digest == manifest.digest):
                     self.discard(work.folder)
-                    return existing.complete
+                    return kept
                 self.discard(final)
             try:
                 work.out.rename(final)

@@ -16,12 +16,14 @@ from cleargs.capture.model import read_model, transform_model, write_model
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.digest import named_files
 from cleargs.errors import InputError
-from cleargs.files import disk_errors, write_json
+from cleargs.files import disk_errors, write_bytes, write_json
 from cleargs.formation.frames import view_of
 from cleargs.manifest import linked_manifest
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
-from cleargs.run_results import SCENE
+from cleargs.run_results import scene_path
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, write_scene
 from cleargs.splat.ply import read_ply
@@ -60,14 +62,12 @@ def export_scene(
     if options.up is not None and options.world == "input":
         raise InputError("--up and --world input exclude each other", hint="give one of them")
     thresholds, region = parse_prune(options.prune), parse_crop(options.crop)
-    for output in outputs:
-        if output.exists() and not options.force:
-            raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+    check_outputs(outputs, installed(), run, force=options.force)
     ingest = run / "ingest"
     posed = [frame for frame in load_frames(ingest) if frame.registered]
     cameras = {frame.frame_id: (frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed}
     similarity = _similarity(ingest, cameras, options)
-    scene, messages = read_ply(run / stage / SCENE), []
+    scene, messages = read_ply(scene_path(run, stage)), []
     if thresholds:
         scene, message = prune_scene(scene, thresholds, run, stage, reporter)
         messages.append(message)
@@ -76,6 +76,7 @@ def export_scene(
     if options.world == "input" and (offset := far_offset(scene.gaussians, similarity)):
         similarity["translation"] = similarity["translation"] - np.array(offset)
         file = outputs[0].with_name(f"{_stem(outputs[0])}.offset.json")
+        check_outputs([file], installed(), run)
         write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
         messages.append(
             "single precision would round positions so far from the origin: the files are written without "
@@ -160,6 +161,7 @@ def _write_sidecars(
                 raise InputError(
                     f"{target} exists already, of another export", hint="choose another name, or give --force"
                 )
+            check_outputs([target], installed(), ingest.parent)
             with disk_errors(target):
                 target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(content)
+            write_bytes(target, content)  # replaces a link, and does not write through it

@@ -19,6 +19,7 @@ from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import real_views
 from cleargs.formation.observed import evaluate_views
 from cleargs.formation.table import read_formation
+from cleargs.packed import read_pack
 from cleargs.parquet import read_table
 from cleargs.progress import Reporter
 from cleargs.rva.tables import FRAMES
@@ -74,7 +75,7 @@ def prune_scene(
     """Remove the Gaussians below one of the ``thresholds`` of `parse_prune`.
 
     Returns the smaller scene, and a message with the number of removed Gaussians and the PSNR before and
-    after, measured on the training frames with the image formation of ``stage``.
+    after, measured on the training frames with the image formation of ``stage`` (not in a packed run).
     """
     ingest, folder = run / "ingest", run / stage
     allocation = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
@@ -86,12 +87,12 @@ def prune_scene(
             largest = contributions(scene, (view.camera for view in views), task.advance)
         keep &= largest >= thresholds["contribution"]
     smaller = replace(scene, gaussians=gaussians.select(keep))
+    removed = f"pruned {gaussians.num - smaller.gaussians.num} of {gaussians.num} Gaussians"
+    if read_pack(run) is not None:
+        return smaller, f"{removed}; a packed run has no images to measure the PSNR"
     with reporter.task("PSNR", 2 * len(views)) as task:
         before, after = (_psnr(which, views, folder, task.advance) for which in (scene, smaller))
-    return smaller, (
-        f"pruned {gaussians.num - smaller.gaussians.num} of {gaussians.num} Gaussians; PSNR of {len(views)} "
-        f"training frames {before:.2f} -> {after:.2f} dB"
-    )
+    return smaller, (f"{removed}; PSNR of {len(views)} training frames {before:.2f} -> {after:.2f} dB")
 
 
 def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, advance: Callable[[], None]) -> float:

@@ -17,9 +17,13 @@ from cleargs.formation.frames import view_of
 from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
+from cleargs.packed import require_images
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
 from cleargs.render.output import Kind, Shot, kind_of, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
+from cleargs.run_results import scene_path
 from cleargs.safe_io import FAULTS, cause, read_json
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
@@ -81,7 +85,8 @@ class ShotOptions:
 
 
 def render_run(
-    scene: Path,
+    run: Path,
+    stage: str,
     output: Path,
     options: ShotOptions,
     reporter: Reporter,
@@ -89,7 +94,7 @@ def render_run(
     force: bool = False,
     device: str = "cpu",
 ) -> list[Shot]:
-    """Render the scene file of a stage, in its run folder, to ``output``. Return the shots.
+    """Render the scene of a stage of ``run`` to ``output``. Return the shots.
 
     Raises InputError if an option cannot be used, or if ``output`` exists and is not to be replaced.
     """
@@ -97,11 +102,14 @@ def render_run(
     kind = kind_of(output)
     if kind == "folder" and output.parent.exists():  # it may contain other files than stills
         raise InputError(f"{output.parent} exists already", hint="choose a new folder")
-    if kind != "folder" and output.exists() and not force:
-        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
-    shots = _shots(scene.parents[1] / "ingest", options, kind)
+    inputs = () if options.poses is None else (options.poses,)
+    check_outputs([output], installed(), run, inputs=inputs, force=force)
+    if options.side_by_side:
+        require_images(run, "--side-by-side")
+    shots = _shots(run / "ingest", options, kind)
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
-        write_shots(output, read_ply(scene), shots, task, fps=options.fps, codec=options.codec, device=device)
+        scene = read_ply(scene_path(run, stage))
+        write_shots(output, scene, shots, task, fps=options.fps, codec=options.codec, device=device)
     return shots
 
 

@@ -47,6 +47,21 @@ attic,attic.mp4,mine.toml,5,,,\r
 barn,/barn,smoke,5,"""
 
 
+@pytest.mark.parametrize(
+    ("sheet", "capture"), [("summary.csv", "a"), ("s.csv", "report/a"), ("s.csv", "logs")]
+)
+def test_a_batch_does_not_replace_its_sheet_or_captures(
+    sheet: str, capture: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / capture).mkdir(parents=True)
+    (tmp_path / capture / "1.txt").write_text("1")
+    (tmp_path / sheet).write_text(text := f"name,input\na,{capture}\n")
+    dag = ToyBatch(tmp_path).dag
+    assert invoke(["batch", str(tmp_path / sheet), "-o", str(tmp_path), "--device", "cpu"], dag) == 2
+    assert "the batch would replace" in capsys.readouterr().err
+    assert (tmp_path / sheet).read_text() == text and (tmp_path / capture / "1.txt").exists()
+
+
 @pytest.mark.parametrize(("name", "text"), [("s.toml", TOML), ("s.csv", CSV + 'padded,"[1, 2]",\r\n')])
 def test_toml_and_csv_sheets_are_equivalent(tmp_path: Path, name: str, text: str) -> None:
     attic, barn = read(tmp_path, name, text)

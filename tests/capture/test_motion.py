@@ -114,7 +114,7 @@ def test_keypoints_are_spread_over_the_picture() -> None:
 def capture(readout: float, frames: int = 24, columns: bool = False, noise: float = 0.3) -> tuple:
     """Keypoints of a walk along an arc with a shaking hand, and the geometry of a reconstruction."""
     rng = np.random.default_rng(2)
-    points = rng.uniform((-2, -1, -1), (2, 1, 1), (600, 3)) + (0, 0, 4)
+    points = rng.uniform((-2, -1, -1), (2, 1, 1), (600, 3)) + np.array([0, 0, 4])
     angles = np.linspace(-0.4, 0.4, frames)
     rotations = Rotation.from_rotvec(np.outer(angles, [0.0, 1.0, 0.0])).as_matrix()
     translations = np.stack([-2 * np.sin(angles), np.zeros(frames), 0.4 - 0.4 * np.cos(angles)], 1)

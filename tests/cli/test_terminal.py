@@ -17,6 +17,7 @@ from cleargs.cli.main import explanation, invoke
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.terminal import EscapingStream
 from cleargs.errors import InputError
+from cleargs.files import disk_error
 from cleargs.safe_io import printable
 
 CLIPBOARD = "\x1b]52;c;ZXZpbA==\x07"
@@ -97,6 +98,36 @@ UNLOADABLE = ImportError("libx.so: failed to map segment from shared object")
 def test_errors_of_the_system_are_explained(error: Exception, code: int, words: str) -> None:
     found, cause, _ = explanation(error)
     assert found == code and words in cause and "unexpected" not in cause
+
+
+def test_out_of_memory_names_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cleargs.cli.main.resource.getrlimit", lambda _: (2_600_000_000, -1))
+    code, cause, remedy = explanation(MemoryError())
+    assert (code, cause) == (1, "out of memory")
+    assert "limit on virtual memory, 2.6 GB: ulimit -v unlimited" in remedy
+
+
+def test_a_disk_without_inodes_is_not_called_full(tmp_path: Path) -> None:
+    error = OSError(errno.ENOSPC, "No space left on device")
+    for words in (explanation(error)[1], str(disk_error(error, tmp_path / "a"))):
+        assert words.startswith("no space left for data or files on the disk")
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "imports"),
+    [
+        ("NUMBA_NUM_THREADS", "0", "numba"),
+        ("NUMBA_NUM_THREADS", "-2", "numba"),
+        ("SOURCE_DATE_EPOCH", "x", "numpy.f2py"),
+    ],
+)
+def test_a_variable_that_a_library_refuses_is_named(variable: str, value: str, imports: str) -> None:
+    code = f"from cleargs.cli.main import explanation\ntry:\n    import {imports}\n"
+    code += "except Exception as error:\n    print(*explanation(error), sep='; ')"
+    environment = {**os.environ, variable: value}
+    told = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert told.stdout.startswith(f"2; the environment variable {variable}={value} cannot be used: ")
+    assert explanation(ValueError("no library"))[1] == "unexpected ValueError: no library"
 
 
 def test_a_path_that_is_too_long(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:

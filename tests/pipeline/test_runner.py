@@ -16,7 +16,7 @@ from cleargs.errors import InputError, StageError, StoreError
 from cleargs.manifest import read_manifest, write_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.runner import check_same_input
+from cleargs.pipeline.runner import Runner, check_same_input
 from cleargs.pipeline.stage import Estimate
 from cleargs.pipeline.store import Store
 
@@ -206,9 +206,22 @@ def test_too_little_address_space_is_refused_before_any_work(
 ) -> None:
     """Under ``ulimit -v 700000``, OpenBLAS requested memory in an endless loop."""
     monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (716_800_000, -1))
-    with pytest.raises(InputError, match="virtual memory is 717 MB"):
+    with pytest.raises(InputError, match=r"virtual memory \(ulimit -v\) is 717 MB; 2.0 GB are needed"):
         bench.run()
     assert stages_run(bench) == []
+
+
+def test_the_address_space_of_all_stages_is_checked_before_any_work(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """2.6 GB passed the first check, and g0 failed, with advice about the capture."""
+    bench.run(until="count")
+    bench.work_done()
+    monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (2_600_000_000, -1))
+    with pytest.raises(InputError, match=r"is 2.6 GB; 3.6 GB are needed"):
+        bench.run()
+    assert stages_run(bench) == []
+    assert bench.run(until="count")[0].how == "found", "nothing is to be done"
 
 
 def test_status_names_what_changed(bench: Bench) -> None:
@@ -333,6 +346,30 @@ def test_run_inside_its_input_is_refused(bench: Bench) -> None:
     at_it = replace(bench.settings(), folder=bench.capture, source=bench.capture)
     with pytest.raises(InputError, match="is the input itself"):
         Planner(bench.dag, at_it, store, 1, bench.remarks).plan()
+
+
+def test_a_run_through_links_inside_its_input_is_refused(bench: Bench, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(bench.capture)
+    inside = replace(bench.settings(), folder=tmp_path / "link" / "run")
+    with pytest.raises(InputError, match="is inside the input"):
+        Planner(bench.dag, inside, Store(bench.store, DigestMemo(bench.store / "d")), 1, bench.remarks).plan()
+    for place in (bench.capture / "store", tmp_path / "link"):
+        with pytest.raises(InputError, match=r"the store .* is inside the input"):
+            bench.run(store=place)
+    assert bench.work_done() == [] and not (bench.capture / "store").exists()
+
+
+@pytest.mark.parametrize("place", ["report", "count", "run.log", ".store/work/mine", "link"])
+def test_an_input_that_the_run_would_replace_is_refused(bench: Bench, place: str, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/link").symlink_to(tmp_path / "run/report")
+    own = tmp_path / "run" / ("report" if place == "link" else place)
+    shutil.copytree(bench.capture, own)
+    settings = replace(bench.settings(), source=tmp_path / "run" / place)
+    store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
+    with pytest.raises(InputError, match="would replace its input"):
+        Runner(bench.dag, settings, store, 1, bench.remarks).run_until()
+    assert len(list(own.iterdir())) == 6
 
 
 def test_missing_file_of_a_late_stage_is_noticed_before_work(bench: Bench, tmp_path: Path) -> None:
