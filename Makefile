@@ -5,6 +5,7 @@
 # make test-package      build wheel and sdist, install them separately, and run the smoke demo from the wheel
 # make drill             kill every stage and gc 50 times and compare the results
 # make fuzz              read 2,000 mutations of each kind of file; SEED=N selects others
+# make findings          run the scripts of findings/, which need the network: what other libraries and formats really do
 # make lint              ruff, codespell, mypy and the check of the prose (tools/prose.py)
 # make docs              build the documentation site in site/; a broken link is an error
 # make dist              build wheel and sdist in dist/
@@ -31,7 +32,7 @@ define install
 endef
 PINS := pyproject.toml requirements.lock constraints.txt
 
-.PHONY: demo env test test-all test-package drill fuzz test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
+.PHONY: demo env test test-all test-package drill fuzz findings test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
 
 env: .venv/demo.stamp
 
@@ -71,6 +72,11 @@ drill: .venv/test.stamp
 fuzz: .venv/test.stamp
 	CLEARGS_FUZZ=2000 $(BIN)/python -m pytest tests/test_fuzz.py --hypothesis-seed=$(or $(SEED),0)
 
+# A script ends with 2 where it cannot be tried; this is not a failure.
+findings:
+	@changed=; for script in findings/*.sh; do echo "== $$script"; $$script || [ $$? = 2 ] || changed="$$changed $$script"; done; \
+	if [ -n "$$changed" ]; then echo "changed:$$changed"; exit 1; fi
+
 test-gpu-kernels: .venv/cuda.stamp
 	TRITON_INTERPRET=1 $(BIN)/python -m pytest -m gpu tests/gpu tests/splat tests/formation
 
@@ -80,7 +86,7 @@ lint: .venv/dev.stamp
 	$(BIN)/codespell
 	$(BIN)/mypy cleargs stages benchmarks tools
 	$(BIN)/python -m tools.prose
-	$(BIN)/python -m tools.prose README.md CHANGELOG.md CONTRIBUTING.md docs
+	$(BIN)/python -m tools.prose README.md CHANGELOG.md CONTRIBUTING.md docs findings
 
 convert-env: .venv-convert/stamp
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
-from cleargs.manifest import Manifest, has_results
+from cleargs.manifest import Manifest, has_results, linked_manifest
 from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.outputs import check_outputs

@@ -14,6 +14,7 @@ PAGES = [
     "CONTRIBUTING.md",
     "SECURITY.md",
     "data/README.md",
+    "findings/README.md",
     "cleargs/models/weights/README.md",
 ]
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")

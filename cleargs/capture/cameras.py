@@ -81,9 +81,14 @@ class Intrinsics:
         return camera.principal_point_x, camera.principal_point_y
 
     @property
+    def is_fisheye(self) -> bool:
+        """Return True for a model that can see 90 degrees and more off its axis."""
+        return self.model in _FISHEYE
+
+    @property
     def is_pinhole(self) -> bool:
         """Return True if the image needs no undistortion."""
-        return self.model not in _FISHEYE and bool(self.colmap().is_undistorted())
+        return not self.is_fisheye and bool(self.colmap().is_undistorted())
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """Return the camera of the same image scaled to another size."""

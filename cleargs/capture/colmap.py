@@ -1,7 +1,8 @@
-"""pycolmap, without the signal handler that importing it installs.
+"""pycolmap, after numpy, and without the signal handler that importing it installs.
 
 Its logging library, glog, catches SIGTERM, prints a stack trace and ends the process. All modules import
-pycolmap from here, so that the program's own handler of SIGTERM stays.
+pycolmap from here, so that the program's own handler of SIGTERM stays. NumPy is imported first:
+pycolmap 4.2.1 as a program's first import does not work together with Pillow 13.0.0.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import signal
 import threading
 
+import numpy
 import pycolmap
 
-__all__ = ["pycolmap"]
+__all__ = ["numpy", "pycolmap"]
 
 if threading.current_thread() is threading.main_thread():  # Python sets signal handlers nowhere else
     # glog changed the handler without Python, which still knows the one before.

@@ -64,6 +64,17 @@ class SparseModel:
         images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in self.images.items()}
         return replace(self, images=images, xyz=similarity.points(self.xyz))
 
+    def misses(self) -> NDArray[np.float64]:
+        """Return the distance of every keypoint from its projected point, px; infinite behind the camera."""
+        found = [np.zeros(0)]
+        for image in self.images.values():
+            xyz = self.xyz[np.searchsorted(self.point_ids, image.point_ids)]
+            rays = xyz @ image.pose.rotation.T + image.pose.translation
+            xy = np.asarray(self.cameras[image.camera_id].colmap().img_from_cam(rays)).reshape(-1, 2)
+            off = np.linalg.norm(xy - image.xy, axis=1)
+            found.append(np.where(np.isfinite(off), off, np.inf))
+        return np.concatenate(found)
+
 
 def read_model(folder: Path) -> SparseModel:
     """Read a binary or text model. Raises InputError when it is damaged or incomplete."""

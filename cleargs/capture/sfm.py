@@ -90,6 +90,7 @@ def reconstruct(
     poses = {frame.image: frame.source.pose for frame in frames if frame.source.pose is not None}
     posed = [frame for frame in frames if frame.image in poses]
     adopted: SparseModel | None = None
+    stale = False
     if not posed:
         model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
@@ -109,7 +110,10 @@ def reconstruct(
                 f"{adopted.dropped} points of the input's sparse model are left out: not finite, or too far"
             )
         missed = float(np.median(adopted.error)) if len(adopted.error) else 0.0
-        if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an unknown error
+        # Some exporters write 0 or -1 for an unknown error. A known one may be older than poses and cameras.
+        misses = adopted.misses()
+        stale = missed > 0 < len(misses) and bool(np.median(misses) > max(2 * missed, config.refine_above))
+        if 0 < missed <= config.refine_above and not stale:
             return Reconstruction(adopted, world, SfmOutcome(placed=_placed(frames, {}), missed_px=missed))
     readings = {name: [world.pose(pose) for pose in read] for name, (world, read) in worlds.items()}
     model, outcome = _run(job_of(posed, readings, folder, config, seed, threads), reporter)
@@ -128,7 +132,7 @@ def reconstruct(
     outcome = outcome.model_copy(update={"placed": _placed(frames, found)})
     if outcome.method == "sfm":
         return _normalised(model, worlds[outcome.convention][0], outcome)
-    if adopted is not None and len(adopted.error) and outcome.method == "given":
+    if adopted is not None and len(adopted.error) and not stale and outcome.method == "given":
         model = adopted
     return Reconstruction(model, worlds[outcome.convention][0], outcome)
 

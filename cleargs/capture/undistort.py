@@ -44,9 +44,11 @@ class Undistorter:
         return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST))
 
     def points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2]
-        """Map pixel positions in the image of the lens to positions in the published image."""
-        rays = self._lens.colmap().cam_from_img(np.ascontiguousarray(xy))
-        return np.asarray(np.asarray(rays) * self.pinhole.focal + np.array(self.pinhole.centre))
+        """Map pixel positions in the image of the lens to positions in the published image.
+
+        Positions that a fisheye sees at 90 degrees or more off its axis are NaN: no flat image shows them.
+        """
+        return np.asarray(_tangents(self._lens, xy) * self.pinhole.focal + np.array(self.pinhole.centre))
 
     def inside(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:  # [K, 2]
         """Return True for each position inside the published image."""
@@ -82,6 +84,17 @@ def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
     return Undistorter(flat.resized(*reduced_size(width, height, max_size)), lens, maps)
 
 
+def _tangents(lens: Intrinsics, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2]
+    """Return x / z and y / z of the rays of pixels [K, 2]; NaN where a fisheye looks to the side or back."""
+    camera = lens.colmap()
+    rays = np.array(camera.cam_from_img(np.ascontiguousarray(xy)), np.float64)
+    if lens.is_fisheye:
+        # From 90 degrees on COLMAP returns finite rays of other directions, which lead to other pixels.
+        again = np.asarray(camera.img_from_cam(np.c_[rays, np.ones(len(rays))]))
+        rays[~(np.abs(again - xy) < 1).all(axis=1)] = np.nan
+    return rays
+
+
 def _covered(lens: Intrinsics) -> tuple[float, float, float, float]:
     """Return left, top, right and bottom (tangents) of the rectangle that the lens's image covers wholly."""
     t = np.linspace(0, 1, _EDGE_SAMPLES)
@@ -89,8 +102,8 @@ def _covered(lens: Intrinsics) -> tuple[float, float, float, float]:
     size = np.array([lens.width, lens.height])
 
     def edge(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        rays = lens.colmap().cam_from_img(np.stack([x, y], axis=1) * size)
-        return np.asarray(rays[np.isfinite(rays).all(axis=1)], np.float64)
+        rays = _tangents(lens, np.stack([x, y], axis=1) * size)
+        return rays[np.isfinite(rays).all(axis=1)]
 
     first = (edge(zero, t)[:, 0], edge(t, zero)[:, 1])
     last = (edge(one, t)[:, 0], edge(t, one)[:, 1])

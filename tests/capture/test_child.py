@@ -162,6 +162,18 @@ def test_importing_colmap_leaves_signals_as_they_are(importer: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "answered\n", "")
 
 
+def test_colmap_as_the_first_import_leaves_other_libraries_working() -> None:
+    program = (
+        "from cleargs.capture.colmap import pycolmap\n"
+        "import io\n"
+        "from PIL import Image\n"
+        "for kind in ('PNG', 'JPEG', 'TIFF', 'WEBP'): Image.new('RGB', (64, 64)).save(io.BytesIO(), kind)\n"
+        "print('saved')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "saved\n")
+
+
 def test_a_full_disk_is_the_cause(module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """COLMAP and SQLite fail at whatever they were doing, and speak of that."""
     usage = child.shutil.disk_usage(module.parent)

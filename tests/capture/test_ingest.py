@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cleargs.capture.cameras import Intrinsics, Pose
-from cleargs.capture.model import read_model
+from cleargs.capture.cameras import Intrinsics, Pose, pinhole
+from cleargs.capture.model import read_model, write_model
 from cleargs.capture.tables import Frame, load_frames, load_observations, load_points
 from cleargs.errors import InputError, StageError
 
@@ -205,6 +206,28 @@ def test_a_sparse_model_of_bad_poses_is_adjusted_too(shaken: Path, ingest: Inges
     second = ingest(first.out, "second")
     assert second.result.summary["kind"] == "colmap" and second.result.summary["poses"] == "refined"
     assert errors_of_poses(second.out)[0] < 0.1
+
+
+def test_errors_that_a_sparse_model_states_are_not_believed(posed: Path, ingest: Ingest) -> None:
+    """A program changed the camera afterwards. COLMAP stores errors and does not renew them."""
+    first = ingest(posed, "first")
+    folder = first.out / "colmap/sparse/0"
+    model = read_model(folder)
+    assert 0 < np.median(model.error) < 0.6 and np.median(model.misses()) < 0.6
+    cameras = {
+        key: pinhole(WIDTH, HEIGHT, 1.2 * camera.focal[0], 1.2 * camera.focal[1], *camera.centre)
+        for key, camera in model.cameras.items()
+    }
+    write_model(folder, replace(model, cameras=cameras), np.zeros((len(model.point_ids), 3), np.uint8))
+    assert np.median(read_model(folder).error) < 0.6 < np.median(read_model(folder).misses())
+    kept, adjusted = ingest(first.out, "kept"), ingest(first.out, "adjusted", refine_above=0.3)
+    assert [done.result.summary["kind"] for done in (kept, adjusted)] == ["colmap", "colmap"]
+    # 0.6 px is less than what other points miss at this camera. They replace those of the input.
+    assert kept.result.summary["poses"] == "input"
+    published = read_model(kept.out / "colmap/sparse/0")
+    assert np.median(published.misses()) < 0.6 and np.median(published.error) > np.median(model.error)
+    assert adjusted.result.summary["poses"] in ("refined", "sfm")
+    assert all(abs(frame.fx / FOCAL - 1) < 0.02 for frame in load_frames(adjusted.out))
 
 
 def test_a_sparse_model_keeps_its_points_where_other_poses_are_no_better(posed: Path, ingest: Ingest) -> None:

@@ -32,7 +32,7 @@ from cleargs.capture.model import ModelImage, SparseModel, read_model, write_mod
 from cleargs.capture.prepare import WorkFrame, read_image, read_stencil
 from cleargs.capture.sfm import job_of
 from cleargs.capture.sources import externals, open_capture
-from cleargs.capture.undistort import undistorter
+from cleargs.capture.undistort import MAX_TANGENT, undistorter
 from cleargs.errors import InputError, StoreError
 from cleargs.media.image import read_rgb
 from cleargs.media.video import Timeline
@@ -68,6 +68,39 @@ def test_undistorted_pixels_are_where_the_pinhole_says(lens: Intrinsics) -> None
     assert np.abs(seen[:, 0] / 0.75 - there[:, 0]).max() < 2.5
     assert np.abs(seen[:, 1] - there[:, 1]).max() < 2
     assert np.allclose(way.points(there), np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-3)
+
+
+WIDE = [
+    ("OPENCV_FISHEYE", 460, (460.0, 460.0, 500.0, 500.0, 0.0, 0.0, 0.0, 0.0)),  # corners at 88 degrees
+    ("OPENCV_FISHEYE", 450, (450.0, 450.0, 500.0, 500.0, 0.0, 0.0, 0.0, 0.0)),  # corners at 90.03 degrees
+    ("OPENCV_FISHEYE", 320, (320.0, 320.0, 500.0, 500.0, 0.0, 0.0, 0.0, 0.0)),  # sides at 89.5 degrees
+    ("OPENCV_FISHEYE", 300, (300.0, 300.0, 500.0, 500.0, 0.01, -0.002, 0.0, 0.0)),
+    ("RADIAL_FISHEYE", 250, (250.0, 500.0, 500.0, 0.02, 0.0)),  # nothing of the edge is in front
+    ("THIN_PRISM_FISHEYE", 310, (310.0, 310.0, 500.0, 500.0, *[0.0] * 8)),
+    ("SIMPLE_RADIAL_FISHEYE", 400, (400.0, 500.0, 500.0, 0.01)),
+    ("FOV", 300, (300.0, 300.0, 500.0, 500.0, 1.0)),  # sides at 80, corners at 102 degrees
+]
+
+
+@pytest.mark.parametrize(("model", "focal", "params"), WIDE)
+def test_a_fisheye_of_any_width_shows_60_degrees_to_each_side(
+    model: str, focal: int, params: tuple[float, ...]
+) -> None:
+    way = undistorter(Intrinsics(model, 1000, 1000, params), 99999)
+    assert way.pinhole.width == way.pinhole.height == int(2 * MAX_TANGENT * focal)
+
+
+def test_points_at_90_degrees_and_behind_are_in_no_flat_image() -> None:
+    way = undistorter(
+        Intrinsics("OPENCV_FISHEYE", 1000, 1000, (320.0, 320.0, 500.0, 500.0, *[0.0] * 4)), 99999
+    )
+    to_the_side = np.array(
+        [[30.0, 30.0], [999.0, 80.0], [500.0 + 320 * np.pi / 2 + 1e-6, 500.0], [0.0, 999.0]]
+    )
+    assert np.isnan(way.points(to_the_side)).all()
+    assert not way.inside(way.points(to_the_side)).any()
+    in_front = np.array([[500.0, 500.0], [200.0, 400.0], [500.0 + 320 * np.radians(60), 500.0]])
+    assert way.inside(way.points(in_front)).all()
 
 
 def test_a_pinhole_is_not_resampled() -> None:

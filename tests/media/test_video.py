@@ -115,6 +115,18 @@ def test_colour_bars_through_h264(tmp_path: Path) -> None:
     assert np.abs(bar_centres(rgb) - BARS).max() <= 3
 
 
+@pytest.mark.parametrize("colour", [(200, 60, 30), (20, 180, 90), (40, 70, 220), (128, 128, 128)])
+def test_a_film_shows_the_colours_that_were_written(tmp_path: Path, colour: tuple[int, int, int]) -> None:
+    """By the tags of the file, as players do. PyAV alone converts by another matrix."""
+    write_video(tmp_path / "film.mp4", [np.full((64, 96, 3), colour, np.uint8)] * 3, 10.0)
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        frame = next(container.decode(video=0))
+        assert (frame.colorspace, frame.color_range) == (1, 1)  # BT.709, limited
+        assert np.abs(frame.to_ndarray(format="rgb24")[32, 48].astype(int) - colour).max() <= 3
+    _, rgb = next(decode_frames(tmp_path / "film.mp4", read_timeline(tmp_path / "film.mp4").pts[:1]))
+    assert np.abs(rgb[32, 48].astype(int) - colour).max() <= 2
+
+
 def test_ten_bits_come_back(tmp_path: Path) -> None:
     path = tmp_path / "bars10.mkv"
     encode(path, bar_planes("bt709", False, bits=10), pixel="yuv420p10le")
