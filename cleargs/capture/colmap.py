@@ -9,9 +9,10 @@ from __future__ import annotations
 import signal
 import threading
 
+import numpy  # before pycolmap: else a later import of Pillow or Matplotlib aborts the process
 import pycolmap
 
-__all__ = ["pycolmap"]
+__all__ = ["numpy", "pycolmap"]
 
 if threading.current_thread() is threading.main_thread():  # Python sets signal handlers nowhere else
     # glog changed the handler without Python, which still knows the one before.
