@@ -48,6 +48,8 @@ class Capture:
     """``pq`` or ``hlg`` for an HDR video, which is tone-mapped."""
     stretch: tuple[float | None, float | None] = (None, None)
     """Start and end of the part of each video that is used, s. None: the first frame, the last frame."""
+    told: str = ""
+    """One line on what is read from a folder and what is left out."""
     notes: tuple[str, ...] = ()
     """Remarks on how the input was read, which are shown as warnings."""
 
@@ -63,8 +65,8 @@ class Layout(Protocol):
     A layout of another package is chosen by name and needs no ``detect``.
     """
 
-    def detect(self, source: Path, *, poses: bool) -> bool:
-        """Return True if file names in ``source`` show this layout. Without ``poses``, ignore pose files."""
+    def detect(self, source: Path, config: CaptureConfig) -> bool:
+        """Return True if the files in ``source`` show this layout. Pose files count if the poses are used."""
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:
         """Return all files that are read, by role: a file, a folder, or single files by name.

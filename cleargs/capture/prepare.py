@@ -182,7 +182,7 @@ def read_stencil(frame: SourceFrame) -> MaskU8 | None:
 def _turn_of_mask(frame: SourceFrame, mask: Path) -> int:
     """Return the EXIF orientation by which ``mask`` is turned with its image; 1 if it fits the upright image.
 
-    The proportions decide. Where they are the same, as for half turns and squares, a mask with the full name
+    The proportions decide. If they are the same, as for half turns and squares, a mask with the full name
     of its image (COLMAP's form, and COLMAP turns no image) is one of the stored pixels, another one is not.
     """
     turn = 1 if frame.pts is not None or _is_as_stored(frame) else orientation(frame.path)

@@ -39,13 +39,13 @@ _PLANE, _PLANE_UNIT, _SIDES = 41486, 41488, (40962, 40963)
 """EXIF tags: pixels per unit on the sensor, that unit, and the size of the picture before it was reduced."""
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
-_DIAGONAL_MM = 43.27  # of 35 mm film, as COLMAP rounds it
+_DIAGONAL_MM = 43.27  # diagonal of 35 mm film, as COLMAP rounds it
 _LONGEST = 4.0
 """Longest focal length by the sensor, in long sides of the picture (144 mm on 35 mm film). Programs that
 reduce pictures and renew their EXIF size only in part state longer ones."""
 
 _DARK, _PHOTOGRAPH = 16, 0.1
-"""A picture is no mask but a photograph if more than this share of it is neither nearly black nor white."""
+"""A picture counts as a photograph, not as a mask, if more than this share of it is neither nearly black nor white."""
 
 _SAME = 2  # levels by which a profile may differ from sRGB and still count as sRGB: rounding, other curves
 

@@ -16,6 +16,7 @@ from cleargs.capture.folders import (
     frame_key,
     image_files,
     is_inside,
+    is_wanted,
     mask_externals,
     require_most,
 )
@@ -25,8 +26,8 @@ from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, open_regular, read_text
 
 
-def detect(source: Path, *, poses: bool) -> bool:
-    return poses and bool(_models(source))
+def detect(source: Path, config: CaptureConfig) -> bool:
+    return config.uses_poses and bool(_models(source))
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
@@ -37,7 +38,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
             images["beside_sparse"] = {path.name: path for path in image_files(source)}
         else:
             images[folder.name] = folder
-    if llff.detect(source, poses=True):
+    if llff.detect(source, config):
         images["poses_bounds"] = source / POSES_BOUNDS
     return {**images, **mask_externals(source), "sparse": _largest(source)}
 
@@ -57,7 +58,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         )
     root, paths, by_stem = find_images(source, list(posed))
     missing = [name for name in posed if name not in paths]
-    if 2 * len(missing) > len(posed) and llff.detect(source, poses=True):
+    if 2 * len(missing) > len(posed) and llff.detect(source, config):
         capture = llff.open_capture(source, config)
         note = (
             f"{len(missing)} of {len(posed)} images of the COLMAP model are missing: {POSES_BOUNDS} is read"
@@ -83,7 +84,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     for name, path in sorted({**stored, **paths}.items(), key=lambda item: frame_key(item[0])):
         image = posed.get(name)
         camera, pose = (None, None) if image is None else (model.cameras[image.camera_id], image.pose)
-        frames.append(SourceFrame(name, path, camera=camera, pose=pose))
+        if is_wanted(path, source, config):
+            frames.append(SourceFrame(name, path, camera=camera, pose=pose))
     taken = chosen(frames, source, config.max_frames)
     sparse = model if len(model.point_ids) or model.dropped else None
     return Capture("colmap", taken, len(frames), sparse, notes=tuple(notes))
