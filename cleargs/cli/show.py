@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from cleargs.cli.commands import as_called
@@ -34,6 +35,7 @@ from cleargs.report.report_json import linked_manifests
 if TYPE_CHECKING:
     from cleargs.report.frames import FrameRow
 
+_NARROWEST = 24  # columns of a terminal that labels have at least
 MAX_LISTED = 16  # items of a list that are printed
 LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; width in px
 HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
@@ -131,7 +133,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
         chosen = {key: found[key] for key in (*OVERVIEW, "published") if key in found} or found
         text = ", ".join(f"{label} {value}" for label, value in labelled(chosen))
         rows.append([name, manifest.status, *cells, text])
-    _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
+    _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures", wraps="figures")
     if None in manifests.values():
         click.echo(as_called(f"not done: see cleargs status {quote(str(run.folder))}"))
     if work := running_stage(run.folder, run.store):
@@ -322,17 +324,21 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:
     """Print a table without rules. ``columns`` are its heads; without heads, the first column has labels.
 
-    Only the column with the head ``wraps`` may wrap. With ``wraps`` the columns are closer together. Brackets
-    in cells are not treated as markup.
+    Labels wrap before values do. Only the column with the head ``wraps`` may wrap. With ``wraps`` the columns
+    are closer together. What still does not fit makes lines longer than the terminal: nothing is cut.
+    Brackets in cells are not treated as markup.
     """
+    rows, console = list(rows), Console(highlight=False, markup=False, emoji=False)
     gap = (0, 1 if wraps else 2, 0, 0)
     table = Table(*columns, box=None, header_style="bold", padding=gap, pad_edge=False)
     table.title, table.title_justify, table.show_header = title or None, "left", bool(columns)
     if not columns:
-        table.add_column(no_wrap=True)
+        longest = max((len(value) for _, value in rows), default=0)
+        table.add_column(max_width=max(_NARROWEST, console.width - 2 - longest))
     for column in table.columns:
         column.no_wrap |= bool(wraps) and column.header != wraps
         column.min_width = 14 if column.header == wraps else None
     for row in rows:
         table.add_row(*row)
-    Console(highlight=False, markup=False, emoji=False).print(table)
+    console.width = max(console.width, Measurement.get(console, console.options, table).minimum)
+    console.print(table)

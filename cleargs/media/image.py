@@ -45,7 +45,8 @@ _LONGEST = 4.0
 reduce pictures and renew their EXIF size only in part state longer ones."""
 
 _DARK, _PHOTOGRAPH = 16, 0.1
-"""A picture counts as a photograph, not as a mask, if more than this share of it is neither nearly black nor white."""
+"""A picture counts as a photograph, not as a mask, if more than this share of it is neither nearly black nor
+nearly white."""
 
 _SAME = 2  # levels by which a profile may differ from sRGB and still count as sRGB: rounding, other curves
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, SourceFrame
@@ -15,6 +17,7 @@ from cleargs.capture.folders import (
     folders_to_search,
     frame_key,
     image_files,
+    image_lines,
     is_inside,
     is_wanted,
     mask_externals,
@@ -23,7 +26,7 @@ from cleargs.capture.folders import (
 from cleargs.capture.layouts import llff
 from cleargs.capture.layouts.llff import POSES_BOUNDS
 from cleargs.errors import InputError
-from cleargs.safe_io import FAULTS, open_regular, read_text
+from cleargs.safe_io import FAULTS, open_regular
 
 
 def detect(source: Path, config: CaptureConfig) -> bool:
@@ -40,7 +43,9 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
             images[folder.name] = folder
     if llff.detect(source, config):
         images["poses_bounds"] = source / POSES_BOUNDS
-    return {**images, **mask_externals(source), "sparse": _largest(source)}
+    folder = _largest(source)
+    tables = {path.name: path for kind in ("bin", "txt") for path in source.glob(f"*.{kind}")}
+    return {**images, **mask_externals(source), "sparse": tables if folder == source else folder}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
@@ -87,18 +92,28 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         if is_wanted(path, source, config):
             frames.append(SourceFrame(name, path, camera=camera, pose=pose))
     taken = chosen(frames, source, config.max_frames)
-    sparse = model if len(model.point_ids) or model.dropped else None
+    views = Counter(chain.from_iterable(image.point_ids.tolist() for image in model.images.values()))
+    seen = any(count > 1 for count in views.values())
+    if len(model.point_ids) and not seen:
+        notes.append(
+            f"no two images see one of the {len(model.point_ids)} points of the COLMAP model, as RealityScan "
+            "and laser scanners export it: points are triangulated from the images"
+        )
+    sparse = model if seen or model.dropped else None
     return Capture("colmap", taken, len(frames), sparse, notes=tuple(notes))
 
 
 def _models(root: Path) -> dict[Path, int]:
-    """Return the folders of sparse models with the number of images of each, ``sparse/0`` first."""
+    """Return the folders of sparse models with the number of images of each, ``sparse/0`` first.
+
+    Several programs write the model next to the images, or ``images`` and ``cameras`` alone.
+    """
     folders: list[Path] = []
     for sparse in (root / "sparse", root / "colmap" / "sparse"):
         if sparse.is_dir():
             folders += [*sorted(path for path in sparse.iterdir() if path.name.isdecimal()), sparse]
     found: dict[Path, int] = {}
-    for folder in folders:
+    for folder in (*folders, root):
         for kind in ("bin", "txt"):
             if (folder / f"images.{kind}").is_file():
                 found.setdefault(folder, _number_of_images(folder / f"images.{kind}"))
@@ -117,7 +132,6 @@ def _number_of_images(file: Path) -> int:
         if file.suffix == ".bin":
             with open_regular(file) as opened:
                 return int(struct.unpack("<Q", opened.read(8))[0])
-        lines = [line for line in read_text(file).splitlines() if not line.startswith("#")]
-        return sum(bool(line.strip()) for line in lines[::2])  # the second line of each has its keypoints
+        return len(image_lines(file))
     except FAULTS:
         return 0
