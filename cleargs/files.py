@@ -77,11 +77,14 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def link_or_copy(file: Path, path: Path) -> None:
-    """Make a symbolic link to ``file`` at ``path``, or a copy on a disk without links (exFAT, SMB)."""
+    """Make a symbolic link to ``file`` at ``path``, or a copy on a disk without links (exFAT, FAT32, SMB).
+
+    A relative ``file`` is relative to the folder of ``path``.
+    """
     try:
         path.symlink_to(file)
     except OSError:
-        shutil.copyfile(file, path)
+        shutil.copy2(path.parent / file, path)
 
 
 def make_folder(path: Path, *, empty: bool = False) -> None:

@@ -70,7 +70,7 @@ class SparseModel:
 def read_model(folder: Path) -> SparseModel:
     """Read a binary or text model. Raises InputError if it is damaged or incomplete.
 
-    It may have no points. Text may lack the empty lines of images without keypoints, as some programs write it.
+    It may have no points. Text may lack the empty lines of images without keypoints: some programs omit them.
     """
     kind = "bin" if (folder / "images.bin").exists() else "txt"
     hint = "export cameras, images and points3D again, all binary or all text, or set ingest.poses=sfm"

@@ -48,7 +48,7 @@ from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store,
 from cleargs.pipeline.settings import flattened
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import duration
-from cleargs.report.report_json import ENTRY
+from cleargs.report.report_json import ENTRY, linked_manifests
 from cleargs.safe_io import printable
 
 Summaries = Mapping[str, Mapping[str, Any]]
@@ -274,6 +274,15 @@ States:
 def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
     """Show for each stage of RUN if it is done, partial or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
+    if not settings.source.exists():
+        shown = linked_manifests(settings.folder, dag.names)
+        plans = [StagePlan(name, "done" if name in shown else "missing", ()) for name in dag.names]
+        print_plans(plans, as_json)
+        note = (
+            f"its input {settings.source} is gone; if it was moved: cleargs run NEWPLACE -o {quote(str(run))}"
+        )
+        click.echo(as_called(note), err=True)
+        return
     with opened_store(settings.store) as opened:
         print_plans(Planner(dag, settings, opened, usable_cores(), make_reporter()).plan(), as_json)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
-from rich.measure import Measurement
 from rich.table import Table
 
 from cleargs.cli.commands import as_called
@@ -336,9 +336,15 @@ def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", 
         longest = max((len(value) for _, value in rows), default=0)
         table.add_column(max_width=max(_NARROWEST, console.width - 2 - longest))
     for column in table.columns:
+        column.overflow = "fold"
         column.no_wrap |= bool(wraps) and column.header != wraps
         column.min_width = 14 if column.header == wraps else None
     for row in rows:
         table.add_row(*row)
-    console.width = max(console.width, Measurement.get(console, console.options, table).minimum)
+    least = [
+        max(len(part) for text in cells for part in ([text] if column.no_wrap else text.split() or [""]))
+        for column, cells in zip(table.columns, zip_longest(*rows, columns, fillvalue=""), strict=True)
+    ]
+    least = [max(width, column.min_width or 0) for width, column in zip(least, table.columns, strict=True)]
+    console.width = max(console.width, sum(least) + gap[1] * (len(least) - 1))
     console.print(table)

@@ -15,7 +15,7 @@ from typing import Literal
 
 from cleargs.digest import file_digest, tree_digest
 from cleargs.errors import CleargsError, InputError, StageError, StoreError
-from cleargs.files import disk_errors
+from cleargs.files import disk_errors, link_or_copy
 from cleargs.manifest import (
     FileRecord,
     Manifest,
@@ -40,7 +40,7 @@ from cleargs.pipeline.plan import (
     rerun_lines,
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, read_source, write_run_file
-from cleargs.pipeline.store import Entry, Store
+from cleargs.pipeline.store import Entry, Store, copied_key
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,14 @@ class Runner(Planner):
         folder, link = self.run.folder, self.run.folder / SCENE
         targets = [Path(name, SCENE) for name in self.dag.names if (folder / name / SCENE).is_file()]
         with disk_errors(link):
-            if link.is_symlink() and link.readlink() not in targets[-1:]:
+            if (link.is_symlink() and link.readlink() not in targets[-1:]) or (
+                any(copied_key(folder / name) for name in self.dag.names)  # a disk without links
+                and link.is_file()
+                and (not targets or link.stat().st_mtime != (folder / targets[-1]).stat().st_mtime)
+            ):
                 link.unlink()
             if targets and not link.is_symlink() and not link.exists():
-                link.symlink_to(targets[-1])
+                link_or_copy(targets[-1], link)
 
     def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
         """Report the cost of the remaining stages again: it is better known once the capture is read."""

@@ -20,6 +20,7 @@ from cleargs.pipeline.run_file import (
     damaged_run_file,
     read_metadata,
     read_source,
+    require_store,
 )
 from cleargs.pipeline.store import STORE_FOLDER, Store
 from cleargs.progress import Reporter
@@ -114,7 +115,10 @@ def resolve_run(
     InputError if ``source`` does not exist or is a run, and ConfigError if a setting is unknown or unusable.
     """
     if not source.exists():
-        raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")
+        hint = "give a video, an image folder or a COLMAP project"
+        if (folder / RUN_FILE).is_file():
+            hint = f"if it was moved, its results are still used: cleargs run NEWPLACE -o {folder}"
+        raise InputError(f"{source} does not exist", hint=hint)
     if (source / RUN_FILE).is_file():
         made_from = read_source(source)
         raise InputError(
@@ -138,6 +142,8 @@ def resolve_run(
             ) from error
     config = load_config(dag, recipe or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
+    if root == metadata.store:
+        require_store(folder, metadata)
     keeps = device == "auto" and metadata.device is not None
     chosen = resolve_device(device, reporter.info, kept=metadata.device, test=test_gpu)
     if kept is not None:

@@ -28,7 +28,7 @@ from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import StoreError
-from cleargs.files import disk_errors, is_partial, sync, sync_tree, write_bytes
+from cleargs.files import disk_errors, is_partial, remove, sync, sync_tree, write_bytes
 from cleargs.manifest import MANIFEST, Manifest, damages, hidden_link, read_manifest, write_manifest
 from cleargs.pipeline.lock import exclusive_lock, file_lock, is_locked
 from cleargs.progress import Reporter
@@ -39,6 +39,9 @@ STORE_FOLDER = ".store"
 
 ROOTS = "roots"
 """Folder in a store with one file per run that uses it."""
+
+COPY = ".copy-of"
+"""File with the key in ``RUN/<stage>``, if that is a copy: the disk has no links."""
 
 SECONDS = "seconds"
 """File in a work folder with the time that earlier attempts took, in seconds."""
@@ -237,29 +240,44 @@ class Store:
         shutil.rmtree(rubbish, ignore_errors=True)
 
     def link(self, run: Path, stage: str, key: str) -> None:
-        """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN."""
+        """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN.
+
+        On a disk without links (exFAT, FAT32, many SMB shares), ``RUN/<stage>`` is a copy with a text file
+        that names the key.
+        """
         target = self.folder(stage, key)
         if target.is_relative_to(run):
             target = target.relative_to(run)
         link = run / stage
         if link.is_symlink() and link.readlink() == target:
             return
-        if link.exists() and not link.is_symlink():
+        if (copied := copied_key(link)) == key:
+            return
+        if link.exists() and not link.is_symlink() and copied is None:
             raise StoreError(
                 f"{link} is a folder, not a link into the store", hint="move it, or choose another -o"
             )
         temporary = run / f".{stage}.link-{os.getpid()}"
         with disk_errors(link):
-            temporary.unlink(missing_ok=True)
-            temporary.symlink_to(target)
+            remove(temporary)
+            try:
+                temporary.symlink_to(target)
+            except OSError:
+                _link_files(self.folder(stage, key), temporary)
+                (temporary / COPY).write_text(key, encoding="ascii")
+                remove(link)
+            if copied is not None:
+                remove(link)
             temporary.replace(link)
-            hidden_link(run, stage).unlink(missing_ok=True)
+            remove(hidden_link(run, stage))
 
     def unlink(self, run: Path, stage: str) -> None:
         """Remove the link ``RUN/<stage>``. The results stay in the store; `last_shown` still finds them."""
         link = run / stage
-        if link.is_symlink():
+        if link.is_symlink() or copied_key(link) is not None:
             with suppress(FileNotFoundError):  # another process removed it
+                if not link.is_symlink():
+                    remove(hidden_link(run, stage))
                 link.replace(hidden_link(run, stage))
 
     def add_root(self, run: Path) -> None:
@@ -291,6 +309,8 @@ class Store:
                     runs.append(Path(read_text(note).rstrip("\n")))
             links = [run / stage for run in runs for stage in stages]
             linked = {link.resolve() for link in links if link.is_symlink()}
+            copies = ((link.name, key) for link in links if (key := copied_key(link)) is not None)
+            linked |= {self.folder(stage, key).resolve() for stage, key in copies}
             folders: list[tuple[Path, Kind]] = [
                 (folder, "finished")
                 for stage in stages
@@ -323,6 +343,14 @@ class Garbage:
     folder: Path
     kind: Kind
     bytes: int
+
+
+def copied_key(link: Path) -> str | None:
+    """Return the key of the results that ``RUN/<stage>`` is a copy of; None if it is something else."""
+    try:
+        return None if link.is_symlink() else (link / COPY).read_text("ascii").strip()
+    except (OSError, ValueError):
+        return None
 
 
 def writer_is_alive(work: Path) -> bool:
