@@ -13,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import frame_key, is_wanted, masks_of, natural_key
+from cleargs.capture.folders import frame_key, image_files, is_wanted, mask_externals, masks_of, natural_key
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 from cleargs.media.headers import Header, lacks_package, read_header
@@ -72,12 +73,30 @@ class Contents:
         parents = {path.parent for path in self.photographs}
         return Path(os.path.commonpath(parents)) if parents else self.root
 
+    def frames(self) -> list[SourceFrame]:
+        """Return the photographs as frames, with the masks of `masks`."""
+        folder = self.folder
+        names = {path: path.relative_to(folder).as_posix() for path in self.photographs}
+        return [SourceFrame(name, path, mask=self.masks.get(path)) for path, name in names.items()]
+
+    def externals(self) -> dict[str, External]:
+        """Return photographs and masks by role (`Layout.externals`)."""
+        folder = self.folder
+        role = "capture" if folder == self.root else "images"
+        found: dict[str, External] = {role: folder, **mask_externals(self.root)}
+        if len(self.photographs) != len(image_files(folder)):
+            found[role] = {path.relative_to(folder).as_posix(): path for path in self.photographs}
+        if self.masks:
+            found["masks_beside"] = {m.relative_to(self.root).as_posix(): m for m in self.masks.values()}
+        return found
+
     def told(self) -> str:
         """Return one line on what is taken, from which folders, and what is left out."""
-        taken = self.videos if self.is_video else self.photographs
-        rest = [self._counted(kind, files) for kind, files in self.left_out.items() if files]
-        line = self._counted(VIDEOS if self.is_video else PHOTOGRAPHS, taken)
-        return f"read: {line}; left out: {', '.join(rest)}" if rest else f"read: {line}"
+        counted = {kind: self._counted(kind, files) for kind, files in self.left_out.items() if files}
+        masks = counted.pop(MASKS, None)
+        kind, taken = (VIDEOS, self.videos) if self.is_video else (PHOTOGRAPHS, self.photographs)
+        line = " and ".join(filter(None, ["read: " + self._counted(kind, taken), masks]))
+        return f"{line}; left out: {', '.join(counted.values())}" if counted else line
 
     def warnings(self) -> tuple[str, ...]:
         """Return a line for each kind of files that the user may miss, with the remedy."""
@@ -122,11 +141,10 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     if len(left_out[UNREADABLE]) == len(images):  # reading the first one names the remedy
         left_out[UNREADABLE] = []
     images = _without(images, left_out[UNREADABLE])
-    if any(path.is_relative_to(root / "images") for path in images):
+    inside = {path for path in images if path.parts[len(root.parts)] == "images" and path.parent != root}
+    if inside:
         # The place of the images in all layouts: what is elsewhere was put there on purpose.
-        left_out[OUTSIDE] = [
-            p for p in images if not p.is_relative_to(root / "images") and not _mask_folder(p, root)
-        ]
+        left_out[OUTSIDE] = [p for p in images if p not in inside and not _mask_folder(p, root)]
         images = _without(images, left_out[OUTSIDE])
     left_out[MASKS] = _masks(images, root)
     headers = {path: read_header(path) for path in _without(images, left_out[MASKS])}
@@ -163,10 +181,9 @@ def _without(files: Sequence[Path], others: Sequence[Path]) -> list[Path]:
 
 def _mask_folder(path: Path, root: Path) -> Path | None:
     """Return the folder of masks below ``root`` that has the file ``path``, or None."""
-    return next(
-        (p for p in path.parents if p != root and p.is_relative_to(root) and _MASK_FOLDER.fullmatch(p.name)),
-        None,
-    )
+    depth = len(root.parts)
+    found = (n for n, part in enumerate(path.parts[depth:-1], depth) if _MASK_FOLDER.fullmatch(part))
+    return next((Path(*path.parts[: n + 1]) for n in found), None)
 
 
 def _unmasked(path: Path) -> Path:
@@ -189,7 +206,8 @@ def _masks(images: Sequence[Path], root: Path) -> list[Path]:
 def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
     """Return photograph -> its mask, in a folder of masks or next to it (``NAME_mask.png``)."""
     by_stem = {path.with_suffix(""): path for path in contents.photographs}
-    names = {path.relative_to(contents.folder).as_posix(): path for path in contents.photographs}
+    root = contents.folder
+    names = {path.relative_to(root).as_posix(): path for path in contents.photographs}
     found = {by_stem[_unmasked(mask)]: mask for mask in masks if _unmasked(mask) in by_stem}
     for folder in dict.fromkeys(_mask_folder(mask, contents.root) for mask in masks):
         if folder is not None:

@@ -113,6 +113,8 @@ def is_wanted(path: Path, root: Path, config: CaptureConfig) -> bool:
 
     A pattern may be a name or a path below ``root``, of the file or of one of its folders.
     """
+    if config.only is None and config.skip is None:
+        return True
     below = PurePosixPath(path.relative_to(root) if path.is_relative_to(root) else path.name)
     spellings = {*map(str, (below, *below.parents)), *below.parts}
 

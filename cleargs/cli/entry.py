@@ -17,7 +17,7 @@ def main() -> None:
         sys.exit(2)
     if sys.getfilesystemencoding() != "utf-8" and os.environ.get("PYTHONUTF8") != "1":
         # In a locale such as Latin-1, Python and the libraries would read the bytes of a path differently.
-        for name in ("stdout", "stderr"):  # what is printed keeps the encoding of the terminal
+        for name in ("stdout", "stderr"):  # the output keeps the encoding of the terminal
             os.environ.setdefault("PYTHONIOENCODING", getattr(getattr(sys, name), "encoding", "") or "")
         os.environ["PYTHONUTF8"] = "1"
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])

@@ -325,7 +325,7 @@ def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", 
     """Print a table without rules. ``columns`` are its heads; without heads, the first column has labels.
 
     Labels wrap before values do. Only the column with the head ``wraps`` may wrap. With ``wraps`` the columns
-    are closer together. What still does not fit makes lines longer than the terminal: nothing is cut.
+    are closer together. Nothing is cut: lines may be longer than the terminal.
     Brackets in cells are not treated as markup.
     """
     rows, console = list(rows), Console(highlight=False, markup=False, emoji=False)

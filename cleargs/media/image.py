@@ -285,7 +285,7 @@ def _srgb_from_profile(image: Image.Image, profile: bytes) -> Image.Image | None
     """
     with suppress(ImageCms.PyCMSError, *_FAULTS):
         source = ImageCms.getOpenProfile(io.BytesIO(profile))
-        mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[source.profile.xcolor_space.strip()]
+        mode = {"RGB": "RGB", "GRAY": "L"}[source.profile.xcolor_space.strip()]
         if mode != "RGB" and image.mode != mode:
             return None
         srgb, how = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC

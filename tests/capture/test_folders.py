@@ -239,3 +239,36 @@ def test_other_files_and_folders_stand_for_themselves(tmp_path: Path, images: Pa
     assert whole_capture(images / "view3.png") == images
     assert whole_capture(tmp_path / "2024/a.png") == tmp_path / "2024"
     assert whole_capture(tmp_path / "nothing") == tmp_path / "nothing"
+
+
+def test_videos_next_to_few_photographs_are_the_capture(tmp_path: Path, frames: Frames) -> None:
+    write(apps.stray, tmp_path / "a", frames)
+    (tmp_path / "a/rgb.mp4").rename(tmp_path / "walk.mp4")
+    shutil.rmtree(tmp_path / "a")
+    cv2.imwrite(str(tmp_path / "poster.jpg"), frames[0][1])
+    capture = open_capture(tmp_path, IngestConfig())
+    assert capture.kind == "video" and "1 photograph (poster.jpg)" in capture.told
+    (tmp_path / "100GOPRO").mkdir()
+    (tmp_path / "walk.mp4").rename(tmp_path / "100GOPRO/GX01.MP4")
+    assert open_capture(tmp_path, IngestConfig()).kind == "video"
+
+
+@pytest.mark.parametrize(
+    "place", ["mask/{}.png", "shots/masks/{}.jpg.png", "shots/mask_{}.png", "shots/{}.mask.png"]
+)
+def test_masks_at_other_places(tmp_path: Path, frames: Frames, place: str) -> None:
+    for index, (_, image) in enumerate(frames):
+        apps.save(tmp_path / f"shots/{index:03d}.jpg", image)
+        apps.save(
+            tmp_path / place.format(f"{index:03d}"), np.full((240, 320, 3), 255 * (index > 0), np.uint8)
+        )
+    capture = open_capture(tmp_path, IngestConfig())
+    stencils = [read_stencil(frame) for frame in capture.frames]
+    assert len(stencils) == 10 and "and 10 masks" in capture.told
+    assert [None if s is None else bool(s.all()) for s in stencils] == [False] + [True] * 9
+
+
+def test_raw_photographs_are_told(images: Path) -> None:
+    for name in ("a.DNG", "b.CR3", "c.psd"):
+        (images / name).write_bytes(b"II*\0")
+    assert "3 raw or other pictures (a.DNG, b.CR3, c.psd)" in open_capture(images, IngestConfig()).told

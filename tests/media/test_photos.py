@@ -227,3 +227,15 @@ def test_a_photograph_for_3d_screens_is_its_first_picture(tmp_path: Path) -> Non
         tmp_path / "a.jpg", "MPO", save_all=True, append_images=[second], quality=95
     )
     assert np.abs(read_rgb(tmp_path / "a.jpg").astype(int) - stripes())[5:15, 4::16].max() < 12
+
+
+@pytest.mark.parametrize("suffix", [".avifs", ".heics"])
+def test_of_a_series_in_one_file_the_first_picture_is_read(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".heics":
+        heif = pytest.importorskip("pillow_heif", reason="the extra cleargs[heif] is not installed")
+        heif.register_heif_opener()
+    path, kind = tmp_path / f"a{suffix}", "HEIF" if suffix == ".heics" else "AVIF"
+    second = Image.fromarray(stripes()[::-1].copy())
+    Image.fromarray(stripes()).save(path, kind, save_all=True, append_images=[second], quality=95)
+    assert image_size(path) == (64, 40)
+    assert np.abs(read_rgb(path).astype(int) - stripes())[5:15, 4::16].max() < 12

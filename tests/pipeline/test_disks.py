@@ -21,7 +21,7 @@ from cleargs.run_results import scene_stage
 
 @pytest.fixture
 def no_links(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What exFAT answers on Linux."""
+    """Refuse links with the error of exFAT on Linux."""
 
     def refuse(*paths: object, **options: object) -> None:
         raise OSError(38, "Function not implemented")

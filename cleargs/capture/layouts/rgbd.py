@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import contents_of
-from cleargs.capture.folders import chosen, mask_externals
+from cleargs.capture.folders import chosen
 from cleargs.errors import InputError
 from cleargs.media.headers import read_header
 from cleargs.safe_io import faults_as, read_json, read_text
@@ -47,10 +47,15 @@ _Poses: TypeAlias = Mapping[Path | int, _Placed]
 
 class _App(NamedTuple):
     name: str
-    files: Callable[[Path], list[Path]]
-    """Function from the input to the files of poses and cameras; none if another app wrote the folder."""
+    patterns: tuple[str, ...]
+    """Files of poses and cameras. If each pattern has a file, the app wrote the folder."""
     read: Callable[[list[Path], Sequence[Path]], _Poses]
     """Function from these files and the pictures to the poses."""
+
+    def files(self, source: Path) -> list[Path]:
+        """Return the files of poses and cameras below ``source``; none if another app wrote it."""
+        found = [sorted(source.glob(pattern)) for pattern in self.patterns]
+        return [file for files in found for file in files] if all(found) else []
 
 
 def detect(source: Path, config: CaptureConfig) -> bool:
@@ -61,9 +66,10 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
     app, contents = _app_of(source), contents_of(source, config)
     assert app is not None
     poses = {file.relative_to(source).as_posix(): file for file in app.files(source)}
-    taken = contents.videos if contents.is_video else contents.photographs
-    images = {path.relative_to(source).as_posix(): path for path in taken}
-    return {"poses": poses, "images": images, **mask_externals(source)}
+    return {
+        "poses": poses,
+        **({"capture": contents.videos[0]} if contents.is_video else contents.externals()),
+    }
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
@@ -75,12 +81,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         if contents.is_video:
             frames = _of_video(contents.videos[0], placed)
         else:
-            files = {path.relative_to(contents.folder).as_posix(): path for path in contents.photographs}
-            masks = contents.masks
-            frames = [
-                _frame(SourceFrame(name, path, mask=masks.get(path)), placed.get(path))
-                for name, path in files.items()
-            ]
+            frames = [_frame(frame, placed.get(frame.path)) for frame in contents.frames()]
     taken = chosen(frames, source, config.max_frames)
     told = f"{contents.told()}; {len(placed)} poses of {app.name}"
     return Capture("rgbd", taken, len(frames), told=told, notes=contents.warnings())
@@ -130,16 +131,6 @@ def _opengl(matrix: Any) -> Any:
     import numpy as np
 
     return np.asarray(matrix, np.float64)[:3] * [1, -1, -1, 1]
-
-
-def _all_of(*names: str) -> Callable[[Path], list[Path]]:
-    """Return a function that finds files of these names, if all are there."""
-
-    def files(source: Path) -> list[Path]:
-        found = [source / name for name in names]
-        return found if all(path.is_file() for path in found) else []
-
-    return files
 
 
 def _rows(file: Path) -> list[list[str]]:
@@ -193,70 +184,57 @@ def _record3d(files: list[Path], photographs: Sequence[Path]) -> _Poses:
     }
 
 
+def _beside(
+    files: list[Path],
+    photographs: Sequence[Path],
+    name: Callable[[Path], Path],
+    read: Callable[[Any], _Placed],
+) -> _Poses:
+    """Read the JSON file of each picture, which has the path ``name``."""
+    known = set(files)
+    return {path: read(read_json(name(path))) for path in photographs if name(path) in known}
+
+
 def _polycam(files: list[Path], photographs: Sequence[Path]) -> _Poses:
     """Read t_00 to t_23, fx, fy, cx, cy, width, height of cameras/NAME.json for images/NAME.jpg."""
-    known = set(files)
-    placed: dict[Path | int, _Placed] = {}
-    for path in photographs:
-        file = path.parent.with_name(path.parent.name.replace("images", "cameras")) / f"{path.stem}.json"
-        if file in known:
-            data = read_json(file)
-            matrix = [[float(data[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
-            fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
-            placed[path] = _Placed(
-                _opengl(matrix), (fx, fy, cx, cy), (int(data["width"]), int(data["height"]))
-            )
-    return placed
+
+    def placed(data: Any) -> _Placed:
+        matrix = [[float(data[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
+        fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
+        return _Placed(_opengl(matrix), (fx, fy, cx, cy), (int(data["width"]), int(data["height"])))
+
+    def name(path: Path) -> Path:
+        return path.parent.with_name(path.parent.name.replace("images", "cameras")) / f"{path.stem}.json"
+
+    return _beside(files, photographs, name, placed)
 
 
 def _scanner(files: list[Path], photographs: Sequence[Path]) -> _Poses:
     """Read cameraPoseARFrame (16 numbers, by rows) and intrinsics (9, by rows) of frame_N.json."""
-    known = set(files)
-    placed: dict[Path | int, _Placed] = {}
-    for path in photographs:
-        if (file := path.with_suffix(".json")) in known:
-            data = read_json(file)
-            pose, k = ([float(x) for x in data[name]] for name in ("cameraPoseARFrame", "intrinsics"))
-            placed[path] = _Placed(
-                _opengl([pose[row : row + 4] for row in (0, 4, 8)]), (k[0], k[4], k[2], k[5])
-            )
-    return placed
+
+    def placed(data: Any) -> _Placed:
+        pose, k = ([float(x) for x in data[name]] for name in ("cameraPoseARFrame", "intrinsics"))
+        return _Placed(_opengl([pose[0:4], pose[4:8], pose[8:12]]), (k[0], k[4], k[2], k[5]))
+
+    return _beside(files, photographs, lambda path: path.with_suffix(".json"), placed)
 
 
 def _scannet(files: list[Path], photographs: Sequence[Path]) -> _Poses:
     """Read pose/N.txt of color/N.jpg, or N.pose.txt of N.color.png, and intrinsic/intrinsic_color.txt."""
-    known = {file.name.partition(".")[0]: file for file in files if file.parent.name != "intrinsic"}
-    stated = [file for file in files if file.parent.name == "intrinsic"]
-    camera, size = (_camera(_numbers(stated[0])), None) if stated else (_SEVEN, _KINECT)
-    names = {path: path.name.partition(".")[0] for path in photographs}
-    return {
-        path: _Placed(_numbers(known[name]), camera, size) for path, name in names.items() if name in known
-    }
-
-
-def _scannet_files(source: Path) -> list[Path]:
-    stated = source / "intrinsic" / "intrinsic_color.txt"
-    poses = sorted((source / "pose").glob("*.txt")) if (source / "color").is_dir() else []
-    poses = poses or sorted(source.glob("*.pose.txt"))
-    return [*poses, stated] if poses and stated.is_file() else poses
-
-
-def _polycam_files(source: Path) -> list[Path]:
-    places = [
-        place / name for place in (source / "keyframes", source) for name in ("cameras", "corrected_cameras")
-    ]
-    return [file for place in places for file in sorted(place.glob("*.json"))]
+    known = {file.name.partition(".")[0]: file for file in files}
+    stated = known.pop("intrinsic_color", None)
+    camera, size = (_SEVEN, _KINECT) if stated is None else (_camera(_numbers(stated)), None)
+    found = {path: known.get(path.name.partition(".")[0]) for path in photographs}
+    return {path: _Placed(_numbers(file), camera, size) for path, file in found.items() if file is not None}
 
 
 _APPS = (
-    _App("Stray Scanner", _all_of("camera_matrix.csv", "odometry.csv"), _stray),
-    _App("TUM RGB-D", _all_of("rgb.txt", "groundtruth.txt"), _tum),
-    _App(
-        "Record3D",
-        lambda source: _all_of("metadata.json")(source) if (source / "rgb").is_dir() else [],
-        _record3d,
-    ),
-    _App("Polycam", _polycam_files, _polycam),
-    _App("3D Scanner App", lambda source: sorted(source.glob("frame_*.json")), _scanner),
-    _App("ScanNet or 7-Scenes", _scannet_files, _scannet),
+    _App("Stray Scanner", ("camera_matrix.csv", "odometry.csv"), _stray),
+    _App("TUM RGB-D", ("rgb.txt", "groundtruth.txt"), _tum),
+    _App("Record3D", ("metadata.json", "rgb/0.*"), _record3d),
+    _App("Polycam", ("keyframes/*cameras/*.json",), _polycam),
+    _App("Polycam", ("*cameras/*.json",), _polycam),
+    _App("3D Scanner App", ("frame_*.json",), _scanner),
+    _App("ScanNet", ("pose/*.txt", "intrinsic/intrinsic_color.txt"), _scannet),
+    _App("7-Scenes", ("*.pose.txt",), _scannet),
 )
