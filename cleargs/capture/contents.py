@@ -11,6 +11,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from filecmp import cmp
 from pathlib import Path
 
 from cleargs.capture.capture import External, SourceFrame
@@ -284,7 +285,7 @@ def _pixels(header: Header | None) -> int:
 
 
 def _is_copy(path: Path, other: Path, headers: Mapping[Path, Header | None]) -> bool:
-    """Return True if ``path`` has the proportions of ``other`` and is smaller, or is in another format."""
+    """Return True if ``path`` is ``other`` in a smaller size, processed, in another format, or as it is."""
     own, its = headers[path], headers[other]
     if own is None or its is None:
         return False
@@ -292,4 +293,5 @@ def _is_copy(path: Path, other: Path, headers: Mapping[Path, Header | None]) -> 
     alike = abs(w * height - h * width) <= max(width, height) + max(w, h)
     smaller = max(w, h) <= _REDUCED * max(width, height)
     processed = bool(_PROCESSED.search(path.parent.name))
-    return alike and (smaller or processed or path.suffix.lower() != other.suffix.lower())
+    changed = smaller or processed or path.suffix.lower() != other.suffix.lower()
+    return alike and (changed or cmp(path, other, shallow=False))

@@ -14,7 +14,6 @@ from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.errors import InputError, listed
 from cleargs.media import IMAGE_SUFFIXES
-from cleargs.safe_io import read_text
 
 T = TypeVar("T")
 
@@ -72,24 +71,6 @@ def find_images(root: Path, names: Sequence[str]) -> tuple[Path, dict[str, Path]
 
 def _spelling(name: str, by_stem: bool) -> str:
     return PurePosixPath(name).with_suffix("").as_posix().lower() if by_stem else name
-
-
-def image_lines(file: Path) -> list[tuple[str, str]]:
-    """Return the line of each image in COLMAP's ``images.txt``, and the line of its keypoints.
-
-    Some programs leave out the empty lines of images without keypoints. A line of keypoints has numbers only.
-    Raises OSError and UnicodeDecodeError like `read_text`.
-    """
-    lines: list[tuple[str, str]] = []
-    for line in read_text(file).splitlines():
-        words = line.split()
-        if line.startswith("#") or not words:
-            continue
-        if len(words) >= 10 and (len(words) % 3 or not re.fullmatch(r"[-+.\deE]+", words[9])):
-            lines.append((line, ""))
-        elif lines:
-            lines[-1] = lines[-1][0], line
-    return lines
 
 
 def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics, Pose, Similarity, within_reach
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.folders import image_lines
+from cleargs.capture.model_text import image_lines
 from cleargs.errors import InputError
 from cleargs.files import link_or_copy, write_bytes
 from cleargs.safe_io import FAULTS, cause, open_regular, read_bytes

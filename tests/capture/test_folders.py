@@ -175,8 +175,9 @@ def test_two_lenses_of_a_phone_stay(images: Path) -> None:
     assert len(open_capture(images, IngestConfig()).frames) == 10
 
 
-def test_a_run_in_the_folder_is_no_photograph(images: Path) -> None:
-    shutil.copytree(images, images / "room" / "ingest" / "images")
+def test_a_run_in_the_folder_is_no_photograph(images: Path, frames: Frames) -> None:
+    for index, (_, image) in enumerate(reversed(frames)):
+        apps.save(images / f"room/ingest/images/view{index}.png", image)
     assert len(open_capture(images, IngestConfig()).frames) == 20
     (images / "room" / "run.toml").touch()
     assert len(open_capture(images, IngestConfig()).frames) == 10
@@ -272,3 +273,31 @@ def test_raw_photographs_are_told(images: Path) -> None:
     for name in ("a.DNG", "b.CR3", "c.psd"):
         (images / name).write_bytes(b"II*\0")
     assert "3 raw or other pictures (a.DNG, b.CR3, c.psd)" in open_capture(images, IngestConfig()).told
+
+
+def test_poses_in_a_folder_below_are_not_passed_over_in_silence(posed: Path) -> None:
+    outer = posed.parent / "outer"
+    outer.mkdir()
+    posed.rename(outer / "room")
+    capture = open_capture(outer, IngestConfig())
+    assert len(capture.frames) == 10 and capture.kind == "images"
+    assert any(f"give {outer / 'room'} as the input" in note for note in capture.notes)
+    assert open_capture(outer, IngestConfig(poses="sfm")).notes == ()
+
+
+def test_a_backup_of_the_photographs_is_not_read_twice(images: Path, frames: Frames) -> None:
+    shutil.copytree(images, images.parent / "copy")
+    shutil.move(images.parent / "copy", images / "backup")
+    assert len(open_capture(images, IngestConfig()).frames) == 10
+    cv2.imwrite(str(images / "backup/view3.png"), frames[4][1])  # now they are pictures of a second camera
+    assert len(open_capture(images, IngestConfig()).frames) == 20
+
+
+def test_videos_by_choice(tmp_path: Path, frames: Frames) -> None:
+    write(apps.stray, tmp_path / "a", frames)
+    for name in ("walk1.mp4", "walk2.mp4"):
+        shutil.copy(tmp_path / "a/rgb.mp4", tmp_path / name)
+    shutil.rmtree(tmp_path / "a")
+    capture = open_capture(tmp_path, IngestConfig(only="walk2*"))
+    assert {frame.path.name for frame in capture.frames} == {"walk2.mp4"}
+    assert externals(tmp_path, IngestConfig(only="walk2*")) == {"capture": tmp_path / "walk2.mp4"}

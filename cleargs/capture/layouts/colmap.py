@@ -17,7 +17,6 @@ from cleargs.capture.folders import (
     folders_to_search,
     frame_key,
     image_files,
-    image_lines,
     is_inside,
     is_wanted,
     mask_externals,
@@ -25,6 +24,7 @@ from cleargs.capture.folders import (
 )
 from cleargs.capture.layouts import llff
 from cleargs.capture.layouts.llff import POSES_BOUNDS
+from cleargs.capture.model_text import image_lines
 from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, open_regular
 

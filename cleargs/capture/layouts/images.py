@@ -11,6 +11,8 @@ from cleargs.capture.contents import contents_of
 from cleargs.capture.folders import chosen
 from cleargs.errors import InputError
 
+_LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
+
 
 def detect(source: Path, config: CaptureConfig) -> bool:
     """See `Layout.detect`: any folder."""
@@ -30,5 +32,9 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
             f"{source} holds no images, no video and no transforms.json",
             hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
         )
+    nested = (
+        [path for name in _LISTS for path in sorted(source.glob(f"*/{name}"))] if config.uses_poses else []
+    )
+    notes = [f"poses in {path} are not read: give {path.parent} as the input" for path in nested[:1]]
     taken = chosen(frames, source, config.max_frames)
-    return Capture("images", taken, len(frames), told=contents.told(), notes=contents.warnings())
+    return Capture("images", taken, len(frames), told=contents.told(), notes=(*contents.warnings(), *notes))
