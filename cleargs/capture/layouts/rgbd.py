@@ -17,6 +17,7 @@ from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import contents_of
 from cleargs.capture.folders import chosen
+from cleargs.capture.layouts import images, video
 from cleargs.errors import InputError
 from cleargs.media.headers import read_header
 from cleargs.safe_io import faults_as, read_json, read_text
@@ -73,30 +74,35 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """See `Layout.open_capture`. Pictures without a pose are frames too."""
+    """See `Layout.open_capture`. Pictures without a pose are frames too.
+
+    If the poses cannot be read, the capture has none, and a note: another program may have written the files.
+    """
     app, contents = _app_of(source), contents_of(source, config)
     assert app is not None
-    with faults_as(InputError, f"cannot read the poses of {app.name} in {source}", hint=_HINT):
-        placed = app.read(app.files(source), contents.photographs)
-        if contents.is_video:
-            frames = _of_video(contents.videos[0], placed)
-        else:
-            frames = [_frame(frame, placed.get(frame.path)) for frame in contents.frames()]
+    try:
+        with faults_as(InputError, f"cannot read the poses of {app.name} in {source}", hint=_HINT):
+            placed = app.read(app.files(source), contents.photographs)
+            if contents.is_video:
+                frames = _of_video(contents.videos[0], placed)
+            else:
+                frames = [_frame(frame, placed.get(frame.path)) for frame in contents.frames()]
+    except InputError as error:
+        capture: Capture = (video if contents.is_video else images).open_capture(source, config)
+        return replace(capture, notes=(*capture.notes, f"{error}; poses are found from the images"))
     taken = chosen(frames, source, config.max_frames)
     told = f"{contents.told()}; {len(placed)} poses of {app.name}"
     return Capture("rgbd", taken, len(frames), told=told, notes=contents.warnings())
 
 
-def _of_video(video: Path, placed: _Poses) -> list[SourceFrame]:
-    """Return the frames of ``video``, whose poses have their numbers. Frames without a pose are left out."""
-    from cleargs.capture.layouts.video import video_frame
+def _of_video(file: Path, placed: _Poses) -> list[SourceFrame]:
+    """Return the frames of a video, whose poses have their numbers. Frames without a pose are left out."""
     from cleargs.media.video import read_timeline, video_size
 
-    timeline, size = read_timeline(video), video_size(video)
-    frames = (
-        (n, video_frame(video, timeline, n, video.stem)) for n in range(len(timeline.pts)) if n in placed
-    )
-    return [_frame(frame, placed[n]._replace(size=size)) for n, frame in frames]
+    timeline, size = read_timeline(file), video_size(file)
+    numbers = [number for number in range(len(timeline.pts)) if number in placed]
+    frames = [video.video_frame(file, timeline, number, file.stem) for number in numbers]
+    return [_frame(frame, placed[n]._replace(size=size)) for n, frame in zip(numbers, frames, strict=True)]
 
 
 def _frame(frame: SourceFrame, placed: _Placed | None) -> SourceFrame:
