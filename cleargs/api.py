@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cleargs.api_parts import Progress, reporter_of, save
+from cleargs.capture.sources import whole_capture
 from cleargs.errors import InputError
 from cleargs.packed import require_images
 from cleargs.pipeline.dag import installed
@@ -73,12 +74,12 @@ def run(
     """
     from cleargs.pipeline.runner import Runner
 
-    dag, reporter = installed(), reporter_of(progress)
+    dag, reporter, capture = installed(), reporter_of(progress), whole_capture(Path(source))
     dag.until(until)
     spec = resolve_run(
         dag,
-        Path(source),
-        default_folder(Path(source)) if folder is None else Path(folder),
+        capture,
+        default_folder(capture) if folder is None else Path(folder),
         recipe=recipe,
         overrides=[
             *([f"g0.quality={quality}"] if quality else []),

@@ -117,6 +117,17 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False) + "\n").encode())
 
 
+def link_or_copy(file: Path, path: Path) -> None:
+    """Make a symbolic link to ``file`` at ``path``, or a copy on a disk without links (exFAT, FAT32, SMB).
+
+    A relative ``file`` is relative to the folder of ``path``.
+    """
+    try:
+        path.symlink_to(file)
+    except OSError:
+        shutil.copy2(path.parent / file, path)
+
+
 def make_folder(path: Path, *, empty: bool = False) -> None:
     """Create a folder at ``path``, replacing a file or link; with ``empty``, delete what is in the folder."""
     if empty or path.is_symlink() or not path.is_dir():

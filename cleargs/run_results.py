@@ -15,7 +15,7 @@ from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import SCENE as SCENE
-from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.run_file import read_metadata, read_run_file, require_store
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -32,6 +32,7 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:
         return stage
+    require_store(run, read_metadata(run))
     message = f"{stage} has no scene in {run}" if stage else f"there is no scene in {run}"
     others = f"; the stages with a scene are {', '.join(done)}" if done else ""
     raise InputError(message, hint=f"see cleargs status {run}{others}")

@@ -10,6 +10,7 @@ import json
 import os
 import stat
 import struct
+import sys
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -157,7 +158,15 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def require_utf8(path: Path | str) -> None:
-    """Raise InputError if the name of ``path`` is not UTF-8, since tables and reports could not store it."""
+    """Raise InputError if the name of ``path`` is not UTF-8, since tables and reports could not store it.
+
+    In a locale with another encoding, libraries would not find a path that is not ASCII.
+    """
+    if sys.getfilesystemencoding() != "utf-8" and not str(path).isascii():
+        raise InputError(
+            f"{str(path)!a} is not ASCII, and the locale has the encoding {sys.getfilesystemencoding()}",
+            hint="set the environment variable PYTHONUTF8=1, or use a UTF-8 locale such as C.UTF-8",
+        )
     try:
         str(path).encode()
     except UnicodeEncodeError as error:

@@ -104,6 +104,8 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
 
     config = context.config
     capture = open_capture(context.source, config)
+    if capture.told:
+        context.reporter.info(capture.told)
     count = len(capture.frames)
     width, height = frame_size(capture) or (1920, 1080)
 
@@ -177,6 +179,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     return StageResult(
         summary={
             "kind": capture.kind,
+            "input": capture.told,
             "poses": {"given": "input", "adjusted": "refined", "sfm": "sfm"}[outcome.method],
             "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
             "pose_convention": outcome.convention if capture.posed else None,

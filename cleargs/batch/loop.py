@@ -24,6 +24,7 @@ from typing import Literal
 from rich.filesize import decimal
 
 from cleargs.batch.sheet import SceneJob, SheetError
+from cleargs.capture.sources import whole_capture
 from cleargs.errors import CleargsError, InputError, listed
 from cleargs.files import write_bytes
 from cleargs.own_files import refuse_links
@@ -275,7 +276,7 @@ class Batch:
     def _run(self, scene: SceneJob) -> RunSpec:
         run = resolve_run(
             self.dag,
-            scene.source,
+            whole_capture(scene.source),
             self.run_folder(scene),
             recipe=scene.recipe,
             overrides=(*self.overrides, *scene.overrides),

@@ -52,6 +52,8 @@ class Capture:
     """All images of a folder in order, before choosing; empty for a video."""
     frame_rate: float | None = None
     """Images per second of a folder, if the user says so (`CaptureConfig.frame_rate`)."""
+    told: str = ""
+    """One line on what is read from a folder and what is left out."""
     notes: tuple[str, ...] = ()
     """Remarks on how the input was read, which are shown as warnings."""
 
@@ -72,8 +74,8 @@ class Layout(Protocol):
     A layout of another package is chosen by name and needs no ``detect``.
     """
 
-    def detect(self, source: Path, *, poses: bool) -> bool:
-        """Return True if file names in ``source`` show this layout. Without ``poses``, ignore pose files."""
+    def detect(self, source: Path, config: CaptureConfig) -> bool:
+        """Return True if the files in ``source`` show this layout. Pose files count if the poses are used."""
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:
         """Return all files that are read, by role: a file, a folder, or single files by name.

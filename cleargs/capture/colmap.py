@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import threading
 
-import numpy
+import numpy  # before pycolmap: else a later import of Pillow or Matplotlib aborts the process
 import pycolmap
 
 __all__ = ["numpy", "pycolmap"]

@@ -38,6 +38,13 @@ class CaptureConfig(FrozenModel):
         description="frames per second of the video from which the images of a folder were taken, by their "
         "numbers; unset: times are in frames, and no readout is given in ms",
     )
+    only: str | None = Field(
+        None,
+        coerce_numbers_to_str=True,
+        description="take only these files of a folder: names, folders or patterns below it, separated by "
+        "commas; unset: all",
+    )
+    skip: str | None = Field(None, description="leave out these files of a folder: like only; unset: none")
     layout: str = Field(
         "auto",
         json_schema_extra={"key": False, "plugin": "layouts"},  # the files that are read are in the key
@@ -46,6 +53,11 @@ class CaptureConfig(FrozenModel):
     poses: Literal["auto", "sfm"] = Field(
         "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
     )
+
+    @property
+    def uses_poses(self) -> bool:
+        """True if poses in the input are used."""
+        return self.poses == "auto"
 
     @field_validator("layout")
     @classmethod

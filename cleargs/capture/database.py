@@ -10,6 +10,7 @@ from pathlib import Path
 
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.sfm_job import Job
+from cleargs.media.image import stated_focal
 
 _MAX_IMAGES = 2**31 - 1
 """COLMAP's number of a pair of images is the id of the first times this, plus the id of the second."""
@@ -60,13 +61,9 @@ def colmap_cameras(job: Job) -> list[pycolmap.Camera]:
 
 def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
     """Set the focal length of ``camera`` to the one in the EXIF data of ``image``, if there is one."""
-    try:
-        stated = pycolmap.infer_camera_from_image(image)
-    except ValueError:  # a format that COLMAP does not read (it gets PNG copies): no EXIF either
+    factor = stated_focal(image)
+    if factor is None:
         return
-    if not stated.has_prior_focal_length:
-        return
-    factor = stated.mean_focal_length() / max(stated.width, stated.height)
     params = list(camera.params)
     for index in camera.focal_length_idxs():
         params[index] = factor * max(camera.width, camera.height)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from cleargs.capture.capture import External, SourceFrame
+from cleargs.capture.config import CaptureConfig
 from cleargs.errors import InputError, listed
-from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
+from cleargs.media import IMAGE_SUFFIXES
 
 T = TypeVar("T")
 
@@ -30,23 +32,13 @@ def image_folders(root: Path) -> list[Path]:
 
 def image_files(folder: Path, *, below: bool = False) -> list[Path]:
     """Return the images in ``folder`` (``below``: in its subfolders too), unordered, without hidden ones."""
-    return _files(folder, IMAGE_SUFFIXES, below=below)
-
-
-def _files(folder: Path, suffixes: Collection[str], *, below: bool = False) -> list[Path]:
     return [
         path
         for path in (folder.rglob("*") if below else folder.iterdir())
-        if path.suffix.lower() in suffixes
+        if path.suffix.lower() in IMAGE_SUFFIXES
         and path.is_file()
         and is_inside(path.relative_to(folder).as_posix())
     ]
-
-
-def folder_of_images(root: Path) -> Path | None:
-    """Return the first of ``images/``, ``root`` itself and the reductions that holds images, or None."""
-    folders = [root / "images", root, *image_folders(root)]
-    return next((folder for folder in folders if folder.is_dir() and image_files(folder)), None)
 
 
 def folders_to_search(root: Path) -> list[Path]:
@@ -97,27 +89,21 @@ def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str,
     return (f"{listing} lists {len(missing)} of {total} {lost}; they are left out",)
 
 
-def videos_in(folder: Path) -> list[Path]:
-    """Return the videos in ``folder`` itself, in natural order, without hidden ones."""
-    return sorted(_files(folder, VIDEO_SUFFIXES), key=lambda path: natural_key(path.name))
+def is_wanted(path: Path, root: Path, config: CaptureConfig) -> bool:
+    """Return True if ``ingest.only`` and ``ingest.skip`` leave the file ``path`` in the capture ``root``.
 
+    A pattern may be a name or a path below ``root``, of the file or of one of its folders.
+    """
+    if config.only is None and config.skip is None:
+        return True
+    below = PurePosixPath(path.relative_to(root) if path.is_relative_to(root) else path.name)
+    spellings = {*map(str, (below, *below.parents)), *below.parts}
 
-def left_out(folder: Path) -> tuple[str, ...]:
-    """Return notes on videos and raw photographs in ``folder``, from which images are read."""
-    notes = []
-    if videos := videos_in(folder):
-        notes.append(
-            f"{_counted(videos, 'video')} in {folder.name}/ left out, as it holds photographs too; "
-            "to take videos, give one as the input, or a folder with videos alone"
-        )
-    if raw := sorted(_files(folder, RAW_SUFFIXES)):
-        notes.append(f"{_counted(raw, 'file')} not read: convert raw photographs and GIFs to JPEG or PNG")
-    return tuple(notes)
+    def fits(patterns: str) -> bool:
+        listed = filter(None, (part.strip().strip("/") for part in patterns.split(",")))
+        return any(fnmatchcase(spelling, pattern) for pattern in listed for spelling in spellings)
 
-
-def _counted(files: Sequence[Path], word: str) -> str:
-    names = ", ".join(path.name for path in files[:3]) + (", ..." if len(files) > 3 else "")
-    return f"{len(files)} {word}{'' if len(files) == 1 else 's'} ({names})"
+    return (config.only is None or fits(config.only)) and not (config.skip is not None and fits(config.skip))
 
 
 def is_inside(name: str) -> bool:

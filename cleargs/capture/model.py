@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics, Pose, Similarity, within_reach
 from cleargs.capture.colmap import pycolmap
+from cleargs.capture.model_text import image_lines
 from cleargs.errors import InputError
-from cleargs.files import write_bytes
+from cleargs.files import link_or_copy, write_bytes
 from cleargs.safe_io import FAULTS, cause, open_regular, read_bytes
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, MemoryError, RuntimeError)
@@ -77,26 +79,33 @@ class SparseModel:
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read a binary or text model. Raises InputError when it is damaged or incomplete."""
+    """Read a binary or text model. Raises InputError if it is damaged or incomplete.
+
+    It may have no points. Text may lack the empty lines of images without keypoints: some programs omit them.
+    """
     kind = "bin" if (folder / "images.bin").exists() else "txt"
+    hint = "export cameras, images and points3D again, all binary or all text, or set ingest.poses=sfm"
+    if not (folder / f"cameras.{kind}").exists():
+        raise InputError(f"the COLMAP model in {folder} has no cameras.{kind}", hint=hint)
     try:
         with TemporaryDirectory(prefix="cleargs-model-") as alone:
             # Next to these files pycolmap would also read rigs and frames, whose sizes are not checked.
             for name, end in _ENDS.items():
-                file = folder / f"{name}.{kind}"
-                if kind == "bin":
-                    _require_whole(file, end)
+                file, copy = folder / f"{name}.{kind}", Path(alone, f"{name}.{kind}")
+                if name == "points3D" and not file.exists():
+                    copy.write_bytes(bytes(8 if kind == "bin" else 0))
+                elif kind == "txt" and name == "images":
+                    copy.write_text("\n".join(chain(*image_lines(file))) + "\n", encoding="utf-8")
                 else:
+                    if kind == "bin":
+                        _require_whole(file, end)
                     open_regular(file).close()
-                (Path(alone) / file.name).symlink_to(file.resolve())
+                    link_or_copy(file.resolve(), copy)
             return _converted(pycolmap.Reconstruction(alone))
     except _FAULTS as error:
         # The message of a failed check in COLMAP starts with the line of the source.
         reason = "a file breaks off" if isinstance(error, struct.error) else cause(error).rpartition("] ")[2]
-        raise InputError(
-            f"cannot read the COLMAP model in {folder}: {reason}",
-            hint="export cameras, images and points3D again, all binary or all text, or set ingest.poses=sfm",
-        ) from error
+        raise InputError(f"cannot read the COLMAP model in {folder}: {reason}", hint=hint) from error
 
 
 def write_model(folder: Path, model: SparseModel, rgb: NDArray[np.uint8]) -> None:  # rgb [P, 3]

@@ -17,6 +17,7 @@ from cleargs.files import make_folder, remove
 from cleargs.media.image import (
     image_size,
     is_panorama,
+    orientation,
     read_alpha,
     read_mask,
     read_rgb,
@@ -174,5 +175,19 @@ def _stencilled(
 def read_stencil(frame: SourceFrame) -> MaskU8 | None:
     """Return the mask of the frame, else the transparency of its image; None if all pixels count."""
     if frame.mask is not None:
-        return read_mask(frame.mask)
+        return read_mask(frame.mask, _turn_of_mask(frame, frame.mask))
     return None if frame.pts is not None else read_alpha(frame.path, upright=not _is_as_stored(frame))
+
+
+def _turn_of_mask(frame: SourceFrame, mask: Path) -> int:
+    """Return the EXIF orientation by which ``mask`` is turned with its image; 1 if it fits the upright image.
+
+    The proportions decide. If they are the same, as for half turns and squares, a mask with the full name
+    of its image (COLMAP's form, and COLMAP turns no image) is one of the stored pixels, another one is not.
+    """
+    turn = 1 if frame.pts is not None or _is_as_stored(frame) else orientation(frame.path)
+    if turn == 1:
+        return 1
+    stored, made = image_size(frame.path), image_size(mask)
+    fits = _alike(*made, stored[::-1] if turn >= 5 else stored), _alike(*made, stored)
+    return turn if fits == (False, True) or (all(fits) and mask.stem == frame.path.name) else 1

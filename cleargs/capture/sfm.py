@@ -26,7 +26,7 @@ from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
-from cleargs.media.image import lens_name
+from cleargs.media.image import lens_name, stated_focal
 from cleargs.progress import Reporter
 from cleargs.safe_io import faults_as, read_json
 
@@ -92,7 +92,20 @@ def reconstruct(
     adopted: SparseModel | None = None
     stale = False
     if not posed:
-        model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
+        job = job_of(frames, None, folder, config, seed, threads)
+        try:
+            model, outcome = _found(job, reporter)
+        except StageError:
+            if not any(map(stated_focal, filter(None, job.exif_images))):
+                raise
+            reporter.warn(
+                "with the focal length in the EXIF data of the images too few frames could be placed: "
+                "it may be wrong, and is left out"
+            )
+            alone = folder / "without-exif"
+            alone.mkdir(exist_ok=True)
+            job = job.model_copy(update={"folder": alone, "exif_images": [None] * len(job.exif_images)})
+            model, outcome = _found(job, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         if outcome.torn_at is not None:
             reporter.warn(
@@ -189,9 +202,20 @@ def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, report
         )
 
 
-def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
+def _found(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
+    """Return the model of `_run`. Raises StageError if it has too few frames."""
+    model, outcome = _run(job, reporter)
+    _require_registered(len(model.images), len(job.names), job.config)
+    return model, outcome
+
+
+def _require_registered(registered: int, total: int, config: SfmConfig) -> None:
     if registered < max(3, config.min_registered * total):
         raise StageError(f"only {registered} of {total} frames could be placed in space", hint=_ADVICE)
+
+
+def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
+    _require_registered(registered, total, config)
     if registered < WARN_REGISTERED * total:
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
 

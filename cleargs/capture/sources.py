@@ -8,14 +8,49 @@ from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, Layout
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.layouts import colmap, images, llff, transforms, video
+from cleargs.capture.contents import media_files
+from cleargs.capture.layouts import colmap, images, llff, rgbd, transforms, video
 from cleargs.errors import InputError
+from cleargs.media import IMAGE_SUFFIXES
 from cleargs.plugins import load_plugin
 
 MIN_FRAMES = 3
 """Minimum number of frames. With two, no third frame confirms the points that they see."""
 
-LAYOUTS: tuple[Layout, ...] = (transforms, colmap, llff, video, images)
+LAYOUTS: tuple[Layout, ...] = (transforms, colmap, llff, rgbd, video, images)
+
+
+_TABLES = frozenset(
+    f"{table}.{form}"
+    for table in ("cameras", "images", "points3D", "rigs", "frames")
+    for form in ("bin", "txt", "ply")
+)
+_LISTED = "transforms.json transforms_train.json transforms_test.json transforms_val.json poses_bounds.npy"
+_TRACKED = "camera_matrix.csv odometry.csv metadata.json rgb.txt groundtruth.txt"
+_LISTS = frozenset([*_LISTED.split(), *_TRACKED.split(), "project.ini"])
+_MODELS, _IMAGES = frozenset({"sparse", "colmap", "distorted"}), frozenset({"images", "rgb", "color"})
+"""Files and folders of a capture that may be given in its place."""
+
+
+def whole_capture(path: Path) -> Path:
+    """Return the folder of the capture to which ``path`` belongs: a file of poses, an image, a sparse model.
+
+    Another file or folder is returned as it is.
+    """
+    folder = path.parent
+    if path.is_dir():
+        inside = {name.name for name in path.iterdir()}
+        if not (inside & _TABLES or "sparse" in (path.name, *inside)) or media_files(path):
+            return path
+        folder = path
+    elif path.suffix.lower() in IMAGE_SUFFIXES:
+        known = any((folder.parent / name).exists() for name in (*_LISTS, "sparse", "masks", "depth", "pose"))
+        return folder.parent if folder.name in _IMAGES and known else folder
+    elif path.name not in _TABLES | _LISTS and path.suffix.lower() != ".db":
+        return path
+    while folder.name.isdecimal() or folder.name in _MODELS:
+        folder = folder.parent
+    return folder
 
 
 def layout_of(source: Path, config: CaptureConfig) -> Layout:
@@ -23,8 +58,7 @@ def layout_of(source: Path, config: CaptureConfig) -> Layout:
     if config.layout != "auto":
         named: Layout = load_plugin("layouts", config.layout)
         return named
-    poses = config.poses == "auto"
-    return next(layout for layout in LAYOUTS if layout.detect(source, poses=poses))
+    return next(layout for layout in LAYOUTS if layout.detect(source, config))
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:

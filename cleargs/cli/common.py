@@ -39,6 +39,8 @@ SHORTCUTS = {
     "holdout": "ingest.holdout",
     "start": "ingest.start",
     "end": "ingest.end",
+    "only": "ingest.only",
+    "skip": "ingest.skip",
 }
 """Option -> the setting that it changes."""
 

@@ -12,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 import cleargs
+from cleargs.capture.sources import whole_capture
 from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
     DONE_IN_PART,
@@ -96,6 +97,8 @@ Files in RUN:
 @click.option(
     "--end", type=click.FloatRange(min=0, min_open=True), metavar="S", help="Take a video up to this second."
 )
+@click.option("--only", metavar="GLOB", help="Take only these files of a folder, such as 'cam0' or '*.jpg'.")
+@click.option("--skip", metavar="GLOB", help="Leave out these files of a folder.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of all random numbers.  [default: 0]")
 @click.option("--reset", is_flag=True, help="Replace the settings of an existing run by those of the recipe.")
 @until_option
@@ -149,6 +152,7 @@ def run(
     dag.until(until)
     if folder is None and (source / RUN_FILE).is_file():  # the user gives the run in place of its capture
         folder, source = source, read_run_file(source, dag).source
+    source, given_as = whole_capture(source), source
     folder = folder or default_folder(source)
     if (folder / RUN_FILE).is_file():  # the user's configuration file is for new runs
         of_user = ParameterSource.DEFAULT_MAP
@@ -159,6 +163,8 @@ def run(
     given = with_shortcuts(overrides, shortcuts)
     with kept_log(context, folder / RUN_LOG, writes=not dry_run) as log:
         reporter = make_reporter(quiet)
+        if source != given_as:
+            reporter.info(f"{given_as} is part of the capture {source}, which is read")
         settings = resolve_run(
             dag,
             source,
@@ -277,6 +283,15 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
         why = {name: f"{kept[name]} of {len(manifest.files) + 1} files" for name, manifest in found}
         print_plans([StagePlan(name, "packed", (text,)) for name, text in why.items()], as_json)
         click.echo(f"packed run: {WORKS}", err=as_json)
+        return
+    if not settings.source.exists():
+        shown = linked_manifests(settings.folder, dag.names)
+        plans = [StagePlan(name, "done" if name in shown else "missing", ()) for name in dag.names]
+        print_plans(plans, as_json)
+        note = (
+            f"its input {settings.source} is gone; if it was moved: cleargs run NEWPLACE -o {quote(str(run))}"
+        )
+        click.echo(as_called(note), err=True)
         return
     with opened_store(settings.store) as opened:
         print_plans(Planner(dag, settings, opened, usable_cores(), make_reporter()).plan(), as_json)

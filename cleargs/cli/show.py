@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,7 @@ from cleargs.report.report_json import linked_manifests
 if TYPE_CHECKING:
     from cleargs.report.frames import FrameRow
 
+_NARROWEST = 24  # columns of a terminal that labels have at least
 MAX_LISTED = 16  # items of a list that are printed
 LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; width in px
 HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
@@ -135,7 +137,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
         chosen = {key: found[key] for key in (*OVERVIEW, "published") if key in found} or found
         text = ", ".join(f"{label} {value}" for label, value in labelled(chosen))
         rows.append([name, manifest.status, *cells, text])
-    _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
+    _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures", wraps="figures")
     if read_pack(run.folder):
         click.echo(f"packed run: {WORKS}")
     elif None in manifests.values():
@@ -330,17 +332,27 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:
     """Print a table without rules. ``columns`` are its heads; without heads, the first column has labels.
 
-    Only the column with the head ``wraps`` may wrap. With ``wraps`` the columns are closer together. Brackets
-    in cells are not treated as markup.
+    Labels wrap before values do. Only the column with the head ``wraps`` may wrap. With ``wraps`` the columns
+    are closer together. Nothing is cut: lines may be longer than the terminal.
+    Brackets in cells are not treated as markup.
     """
+    rows, console = list(rows), Console(highlight=False, markup=False, emoji=False)
     gap = (0, 1 if wraps else 2, 0, 0)
     table = Table(*columns, box=None, header_style="bold", padding=gap, pad_edge=False)
     table.title, table.title_justify, table.show_header = title or None, "left", bool(columns)
     if not columns:
-        table.add_column(no_wrap=True)
+        longest = max((len(value) for _, value in rows), default=0)
+        table.add_column(max_width=max(_NARROWEST, console.width - 2 - longest))
     for column in table.columns:
+        column.overflow = "fold"
         column.no_wrap |= bool(wraps) and column.header != wraps
         column.min_width = 14 if column.header == wraps else None
     for row in rows:
         table.add_row(*row)
-    Console(highlight=False, markup=False, emoji=False).print(table)
+    least = [
+        max(len(part) for text in cells for part in ([text] if column.no_wrap else text.split() or [""]))
+        for column, cells in zip(table.columns, zip_longest(*rows, columns, fillvalue=""), strict=True)
+    ]
+    least = [max(width, column.min_width or 0) for width, column in zip(least, table.columns, strict=True)]
+    console.width = max(console.width, sum(least) + gap[1] * (len(least) - 1))
+    console.print(table)

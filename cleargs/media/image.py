@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -30,8 +31,24 @@ _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 _METADATA = 2**18  # bytes at the start of a file that are searched for metadata
 
 _ORIENTATION, _MODEL, _EXIF = 274, 272, 0x8769
-_LENS = (42036, 37386, 41989)
+_FOCAL_MM, _FOCAL_35MM = 37386, 41989
+_LENS = (42036, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags: orientation, camera model, a table of further tags; in it, the lens and its focal lengths."""
+
+_PLANE, _PLANE_UNIT, _SIDES = 41486, 41488, (40962, 40963)
+"""EXIF tags: pixels per unit on the sensor, that unit, and the size of the picture before it was reduced."""
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+
+_DIAGONAL_MM = 43.27  # diagonal of 35 mm film, as COLMAP rounds it
+_LONGEST = 4.0
+"""Longest focal length by the sensor, in long sides of the picture (144 mm on 35 mm film). Programs that
+reduce pictures and renew their EXIF size only in part state longer ones."""
+
+_DARK, _PHOTOGRAPH = 16, 0.1
+"""A picture counts as a photograph, not as a mask, if more than this share of it is neither nearly black nor
+nearly white."""
+
+_SAME = 2  # levels by which a profile may differ from sRGB and still count as sRGB: rounding, other curves
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, Image.DecompressionBombError)
 """Errors that Pillow raises for a file of the wrong form."""
@@ -49,6 +66,29 @@ def lens_name(path: Path) -> tuple[str, ...]:
         more = exif.get_ifd(_EXIF)
         return tuple(str(value) for value in (exif.get(_MODEL), *map(more.get, _LENS)))
     return ()
+
+
+def stated_focal(path: Path) -> float | None:
+    """Return the focal length in the EXIF data of the image in ``path``, in long sides of the picture.
+
+    It is the equivalent on 35 mm film, else that of the sensor, which needs the size that the camera gave the
+    picture: it may have been reduced. None if it is missing, damaged, or none that a camera has.
+    """
+    with suppress(InputError, *FAULTS), _opened(path) as image:
+        tags = image.getexif().get_ifd(_EXIF)
+        if (film := float(tags.get(_FOCAL_35MM) or 0)) > 0:
+            return film / _DIAGONAL_MM * math.hypot(*image.size) / max(image.size)
+        focal_px = float(tags[_FOCAL_MM]) / _UNIT_MM[tags.get(_PLANE_UNIT, 2)] * float(tags[_PLANE])
+        share = focal_px / max(float(tags[side]) for side in _SIDES)
+        return share if 0 < share <= _LONGEST else None
+    return None
+
+
+def orientation(path: Path) -> int:
+    """Return the EXIF orientation of the image in ``path``, 1 to 8; 1 if it is not turned."""
+    with _opened(path) as image:
+        turn = image.getexif().get(_ORIENTATION, 1)
+        return turn if turn in range(1, 9) else 1
 
 
 def is_panorama(path: Path) -> bool:
@@ -73,18 +113,31 @@ def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
     more than `MAX_PIXELS`.
     """
     with _decoded(path, upright=upright) as image:
-        rgb = (_grey(image) if image.mode.startswith("I;16") else image).convert("RGB")
+        eight = _grey(image) if image.mode.startswith("I;16") else image
         profile = image.info.get("icc_profile")
-        return np.array(_srgb_from_profile(rgb, profile) if profile else rgb)
+        made = _srgb_from_profile(eight, profile) if profile else None
+        return np.array(eight.convert("RGB") if made is None else made)
 
 
-def read_mask(path: Path) -> MaskU8:  # [H, W]
+def read_mask(path: Path, turn: int = 1) -> MaskU8:  # [H, W]
     """Return a mask [H, W]: 0 if the pixel is ignored, else 255. Raises InputError like `read_rgb`.
 
-    The threshold is 127, or 0 for masks of 0 and 1, which some programs write.
+    The threshold is 127, or 0 for masks of 0 and 1, which some programs write. If a picture has transparent
+    parts, and its other pixels are all bright or are a photograph, its alpha is the mask. ``turn`` is an EXIF
+    orientation by which the mask is turned.
     """
     with _decoded(path) as image:
-        grey = np.asarray(_grey(image))
+        image.getexif()[_ORIENTATION] = turn
+        turned = ImageOps.exif_transpose(image)
+        grey = np.asarray(_grey(turned))
+        if turned.has_transparency_data:
+            alpha = np.asarray(turned.convert("RGBA"))[..., 3]
+            seen = grey[alpha > 127]
+            between = ((seen > _DARK) & (seen < 255 - _DARK)).mean() if seen.size else 0.0
+            if seen.size < grey.size and (
+                np.ptp(grey) == 0 or seen.min(initial=255) > 127 or between > _PHOTOGRAPH
+            ):
+                grey = alpha
     border = 127 if grey.max() > 1 else 0
     return np.asarray(np.where(grey > border, 255, 0), np.uint8)
 
@@ -224,16 +277,24 @@ def _grey(image: Image.Image) -> Image.Image:
     return image.convert("L")
 
 
-def _srgb_from_profile(rgb: Image.Image, profile: bytes) -> Image.Image:
-    """Return ``rgb`` converted from its ICC ``profile`` to sRGB, relative colorimetric.
+def _srgb_from_profile(image: Image.Image, profile: bytes) -> Image.Image | None:
+    """Return ``image`` converted from its ICC ``profile`` to sRGB, relative colorimetric.
 
-    The image is not changed if the profile is that of sRGB, is not for RGB, or is damaged.
+    None if the profile is that of sRGB by its content (names mislead), is for another kind of pixels, or is
+    damaged.
     """
     with suppress(ImageCms.PyCMSError, *_FAULTS):
         source = ImageCms.getOpenProfile(io.BytesIO(profile))
-        if "srgb" in ImageCms.getProfileDescription(source).lower():
-            return rgb
-        if source.profile.xcolor_space.strip() == "RGB":
-            srgb, how = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
-            return ImageCms.profileToProfile(rgb, source, srgb, renderingIntent=how) or rgb
-    return rgb
+        mode = {"RGB": "RGB", "GRAY": "L"}[source.profile.xcolor_space.strip()]
+        if mode != "RGB" and image.mode != mode:
+            return None
+        srgb, how = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
+        convert = ImageCms.buildTransform(source, srgb, mode, "RGB", renderingIntent=how)
+        if mode == "RGB":
+            levels = np.linspace(0, 255, 9).astype(np.uint8)
+            grid = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(9, 81, 3)
+            made = np.asarray(ImageCms.applyTransform(Image.fromarray(grid), convert), np.int16)
+            if np.abs(made - grid).max() <= _SAME:
+                return None
+        return ImageCms.applyTransform(image.convert(mode), convert)
+    return None

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from av.container import InputContainer
 from av.filter import Graph
+from av.sidedata.sidedata import SideData
 from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
@@ -37,6 +38,7 @@ _PREVIEW = 0.1
 _PROGRESSIVE = 1  # AVFieldOrder: 0 is unknown, above 1 are those of two fields
 _SLACK_S, _SLACK = 0.5, 0.02
 """Time by which a video may be shorter than stated, s and as a share: frame durations are rounded."""
+_LAST_FRAMES = 1.5  # number of mean frame intervals by which the last frame of an MP4 may end too early
 _HINT = "copy the file again, or re-encode what is readable: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4"
 
 
@@ -89,9 +91,13 @@ def read_timeline(path: Path) -> Timeline:
         assert stream.time_base is not None
         stated = _stated_seconds(container, stream)
         short = stated - float(end * stream.time_base) > max(_SLACK_S, _SLACK * stated)
-        # An edit list hides frames: the container counts them, the demuxer drops them.
-        edited = stream.start_time is not None and stream.start_time < 0
-        if short or (stream.frames > len(pts) + 1 and not edited):
+        lacks = stream.frames > len(pts) + 1
+        if container.format.name.startswith("mov") and stream.duration:
+            # The container also counts frames that its edit list hides, as in clips that a phone trimmed or
+            # that were cut without encoding. The stated length is that of the shown part.
+            left = stream.duration + min(stream.start_time or 0, 0) - end
+            lacks &= left * len(pts) > _LAST_FRAMES * (end - min(pts))
+        if short or lacks:
             raise _broken(path, len(pts), stream)
         transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
         interlaced = int(stream.codec_context.field_order) > _PROGRESSIVE
@@ -185,7 +191,20 @@ def _turned(picture: ImageU8, frame: VideoFrame, width: int) -> ImageU8:  # [H, 
         picture = np.asarray(
             cv2.resize(picture, (width, frame.height), interpolation=cv2.INTER_CUBIC), np.uint8
         )
-    return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90) % 4))
+    return np.ascontiguousarray(_displayed(picture, frame))
+
+
+def _displayed(picture: ImageU8, frame: VideoFrame) -> ImageU8:  # [H, W] or [H, W, 3]
+    """Return the picture turned in quarters and mirrored, as the display matrix of its ``frame`` says.
+
+    The matrix maps a stored pixel (x, y) to (a x + c y, b x + d y). `VideoFrame.rotation` has no mirroring.
+    """
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if not isinstance(matrix, SideData):
+        return picture
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    turned, across, down = (picture.swapaxes(0, 1), c, b) if abs(b) > abs(a) else (picture, a, d)
+    return turned[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]
 
 
 def _signal(frame: VideoFrame) -> ImageF32:  # [H, W, 3]

@@ -8,12 +8,12 @@ from textwrap import wrap
 
 import tomli_w
 
-from cleargs.errors import ConfigError, InputError
+from cleargs.errors import ConfigError, InputError, StoreError
 from cleargs.files import disk_errors, write_bytes
 from cleargs.own_files import nodes_below, refuse_links
 from cleargs.pipeline.config import Config, Document, check_document, known_settings, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.store import STORE_FOLDER
+from cleargs.pipeline.store import ROOTS, STORE_FOLDER, copied_key
 from cleargs.types import Device
 
 RUN_FILE = "run.toml"
@@ -152,6 +152,23 @@ def read_metadata(folder: Path) -> RunMetadata:
     return RunMetadata(document, paths.get("input"), paths.get("store"), device, tuple(on_cpu), damaged)
 
 
+def require_store(folder: Path, metadata: RunMetadata) -> None:
+    """Raise StoreError if results of the run in ``folder`` were in a store that is gone, as its disk may be.
+
+    Otherwise all stages would run again, into the empty folder where the disk was.
+    """
+    store = metadata.store
+    if store is None or (store / ROOTS).is_dir():
+        return
+    for link in folder.iterdir():
+        key = copied_key(link)
+        if (link.is_symlink() and not link.exists()) or (key and not (store / link.name / key).exists()):
+            raise StoreError(
+                f"the store {store} of the run {folder} is gone",
+                hint="connect its disk; to begin again in another one: cleargs run INPUT -o RUN --store X",
+            )
+
+
 def known_metadata(folder: Path) -> RunMetadata:
     """Return the content of ``run.toml`` as `read_metadata` does, or empty metadata if it is not TOML."""
     try:
@@ -182,7 +199,10 @@ def read_run_file(
         raise damaged_run_file(folder)
     settings, _ = known_settings(dag, metadata.settings)
     config = check_document(dag, settings)
-    place = checked_store(folder, store or metadata.store or folder / STORE_FOLDER)
+    place = store or metadata.store or folder / STORE_FOLDER
+    if place == metadata.store:
+        require_store(folder, metadata)
+    place = checked_store(folder, place)
     on_cpu, chosen = (metadata.on_cpu, metadata.device) if device is None else ((), device)
     return RunSpec(folder, metadata.source, config, place, chosen or "cpu", on_cpu, device is None)
 

@@ -16,7 +16,7 @@ from typing import Literal
 
 from cleargs.digest import file_digest, tree_digest
 from cleargs.errors import CleargsError, InputError, StageError, StoreError
-from cleargs.files import disk_errors
+from cleargs.files import disk_errors, link_or_copy
 from cleargs.manifest import (
     FileRecord,
     Manifest,
@@ -42,7 +42,7 @@ from cleargs.pipeline.plan import (
     rerun_lines,
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, known_metadata, write_run_file
-from cleargs.pipeline.store import Entry, Store
+from cleargs.pipeline.store import Entry, Store, copied_key
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,15 @@ class Runner(Planner):
         done = [name for name in self.dag.names if has_results(folder, name)]
         targets = [Path(name, SCENE) for name in done if (folder / name / SCENE).is_file()]
         with disk_errors(link):
-            if self._has_scene_link() and link.readlink() not in targets[-1:]:
+            copied = any(copied_key(folder / name) for name in self.dag.names)  # a disk without links
+            if (self._has_scene_link() and link.readlink() not in targets[-1:]) or (
+                copied
+                and link.is_file()
+                and (not targets or link.stat().st_mtime != (folder / targets[-1]).stat().st_mtime)
+            ):
                 link.unlink()
             if targets and not link.is_symlink() and not link.exists():
-                link.symlink_to(targets[-1])
+                link_or_copy(targets[-1], link)
 
     def _has_scene_link(self) -> bool:
         """Return True if ``RUN/scene.ply`` is a link that ClearGS made."""

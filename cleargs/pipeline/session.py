@@ -23,6 +23,7 @@ from cleargs.pipeline.run_file import (
     known_metadata,
     located,
     read_metadata,
+    require_store,
 )
 from cleargs.pipeline.store import MEMO, STORE_FOLDER, Store, check_store, is_store, visible_names
 from cleargs.progress import Reporter
@@ -123,7 +124,10 @@ def resolve_run(
     for place in (folder, source):
         require_images(place, "continuing it")
     if not source.exists():
-        raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")
+        hint = "give a video, an image folder or a COLMAP project"
+        if (folder / RUN_FILE).is_file():
+            hint = f"if it was moved, its results are still used: cleargs run NEWPLACE -o {folder}"
+        raise InputError(f"{source} does not exist", hint=hint)
     if (source / RUN_FILE).is_file():
         made_from = known_metadata(source).source
         raise InputError(
@@ -152,7 +156,10 @@ def resolve_run(
                 f"the settings of {folder} cannot be used: {error}", hint="start from the recipe with --reset"
             ) from error
     config = load_config(dag, recipe or "default" if kept is None else kept.document(), overrides, seed)
-    root = checked_store(folder, (store or metadata.store or folder / STORE_FOLDER).absolute())
+    root = (store or metadata.store or folder / STORE_FOLDER).absolute()
+    if root == metadata.store:
+        require_store(folder, metadata)
+    root = checked_store(folder, root)
     keeps = device == "auto" and metadata.device is not None
     chosen = resolve_device(device, reporter.info, kept=metadata.device, test=test_gpu)
     if kept is not None:

@@ -45,6 +45,9 @@ STORE_FOLDER = ".store"
 ROOTS = "roots"
 """Folder in a store with one file per run that uses it."""
 
+COPY = ".copy-of"
+"""File with the key in ``RUN/<stage>``, if that is a copy: the disk has no links."""
+
 MEMO = "digests.json"
 """File in a store with the digests of files that were read before."""
 
@@ -258,28 +261,43 @@ class Store:
             remove(rubbish)
 
     def link(self, run: Path, stage: str, key: str) -> None:
-        """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN."""
+        """Let the link ``RUN/<stage>`` point to the finished folder; relative if the store is in RUN.
+
+        On a disk without links (exFAT, FAT32, many SMB shares), ``RUN/<stage>`` is a copy with a text file
+        that names the key.
+        """
         target = self.folder(stage, key)
         if target.is_relative_to(run):
             target = target.relative_to(run)
         link = run / stage
         if link.is_symlink() and link.readlink() == target:
             return
-        if link.exists() and not link.is_symlink():
+        if (copied := copied_key(link)) == key:
+            return
+        if link.exists() and not link.is_symlink() and copied is None:
             raise StoreError(
                 f"{link} is a folder, not a link into the store", hint="move it, or choose another -o"
             )
         temporary = run / f".{stage}.link-{secrets.token_hex(4)}"
         with disk_errors(link):
-            temporary.symlink_to(target)
+            try:
+                temporary.symlink_to(target)
+            except OSError:
+                _link_files(self.folder(stage, key), temporary)
+                (temporary / COPY).write_text(key, encoding="ascii")
+                remove(link)
+            if copied is not None:
+                remove(link)
             temporary.replace(link)
-            hidden_link(run, stage).unlink(missing_ok=True)
+            remove(hidden_link(run, stage))
 
     def unlink(self, run: Path, stage: str) -> None:
         """Remove the link ``RUN/<stage>``. The results stay in the store; `last_shown` still finds them."""
         link = run / stage
-        if link.is_symlink():
+        if link.is_symlink() or copied_key(link) is not None:
             with suppress(FileNotFoundError):  # another process removed it
+                if not link.is_symlink():
+                    remove(hidden_link(run, stage))
                 link.replace(hidden_link(run, stage))
 
     def add_root(self, run: Path) -> None:
@@ -319,6 +337,8 @@ class Store:
                     runs.append(Path(read_bytes(note, 65_536, root=self.root).decode().rstrip("\n")))
             links = [run / stage for run in runs for stage in stages]
             linked = {link.resolve() for link in links if link.is_symlink()}
+            copies = ((link.name, key) for link in links if (key := copied_key(link)) is not None)
+            linked |= {self.folder(stage, key).resolve() for stage, key in copies}
             folders: list[tuple[Path, Kind]] = [
                 (folder, "finished")
                 for stage in stages
@@ -384,6 +404,14 @@ def visible_names(folder: Path) -> list[str]:
     places = sorted(folder.iterdir()) if folder.is_dir() else []
     shown = (place for place in places if not place.name.startswith(".") and place.name != "lost+found")
     return [f"{place.name}/" if place.is_dir() else place.name for place in shown]
+
+
+def copied_key(link: Path) -> str | None:
+    """Return the key of the results that ``RUN/<stage>`` is a copy of; None if it is something else."""
+    try:
+        return None if link.is_symlink() else (link / COPY).read_text("ascii").strip()
+    except (OSError, ValueError):
+        return None
 
 
 def writer_is_alive(work: Path) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -122,6 +123,77 @@ def test_named_images_of_a_reduced_folder(project: Path) -> None:
     rename_all(project / "images", ".jpg")
     capture = open_capture(project, IngestConfig())
     assert {frame.path.parent.name for frame in capture.frames} == {"images_4"}
+
+
+def as_text(project: Path) -> Path:
+    """Write the model of ``project`` as text, in place of the binary one."""
+    folder = project / "sparse/0"
+    pycolmap.Reconstruction(folder).write_text(folder)
+    for file in folder.glob("*.bin"):
+        file.unlink()
+    return folder
+
+
+@pytest.mark.parametrize("form", ["bin", "txt"])
+@pytest.mark.parametrize("what", ["no tracks", "no points", "no file of points", "points3D.ply"])
+def test_models_without_tracks_are_triangulated(project: Path, ingest: Ingest, form: str, what: str) -> None:
+    """As RealityScan, Metashape and programs for laser scanners write them."""
+    folder = as_text(project)
+    lines = (folder / "images.txt").read_text().splitlines()
+    lines = [line if line.startswith("#") or line.endswith("png") else "" for line in lines]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    points = (folder / "points3D.txt").read_text().splitlines()
+    bare = [" ".join(line.split()[:8]) for line in points if not line.startswith("#")]
+    (folder / "points3D.txt").write_text("\n".join(bare if what == "no tracks" else []) + "\n")
+    if form == "bin":
+        pycolmap.Reconstruction(folder).write_binary(folder)
+        for file in folder.glob("*.txt"):
+            file.unlink()
+    if what in ("no file of points", "points3D.ply"):
+        (folder / f"points3D.{form}").unlink()
+    if what == "points3D.ply":
+        (folder / "points3D.ply").write_bytes(b"ply\n")
+    done = ingest(project)
+    assert done.result.summary["registered"] == 10 and done.result.summary["points"] > 100
+    assert done.result.summary["poses"] == "input"
+    assert any("no two images see" in line for line in done.warnings) == (what == "no tracks")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_text_without_its_empty_lines(project: Path, end: str, mark: str) -> None:
+    folder = as_text(project)
+    lines = (folder / "images.txt").read_text().splitlines()
+    posed = [line for line in lines if line.endswith("png")]
+    (folder / "images.txt").write_text(mark + end.join(posed) + end, newline="")
+    (folder / "points3D.txt").write_text("")
+    assert sum(frame.pose is not None for frame in open_capture(project, IngestConfig()).frames) == 10
+
+
+def test_a_model_next_to_its_images(project: Path) -> None:
+    before = open_capture(project, IngestConfig())
+    for file in (project / "sparse/0").iterdir():
+        file.rename(project / file.name)
+    shutil.rmtree(project / "sparse")
+    capture = open_capture(project, IngestConfig())
+    assert capture.kind == "colmap" and [f.pose is None for f in capture.frames] == [False] * 10
+    assert capture.n_available == before.n_available
+    assert set(externals(project, IngestConfig())["sparse"]) == {
+        f"{n}.bin" for n in ("cameras", "images", "points3D")
+    }
+
+
+def test_rigs_and_frames_of_colmap_4(project: Path) -> None:
+    folder = project / "sparse/0"
+    pycolmap.Reconstruction(folder).write_binary(folder)
+    assert (folder / "rigs.bin").is_file() and (folder / "frames.bin").is_file()
+    assert sum(frame.pose is not None for frame in open_capture(project, IngestConfig()).frames) == 10
+
+
+def test_a_model_without_cameras_names_the_file(project: Path) -> None:
+    (project / "sparse/0/cameras.bin").unlink()
+    with pytest.raises(InputError, match=r"has no cameras\.bin"):
+        open_capture(project, IngestConfig())
 
 
 # -- transforms.json ---------------------------------------------------------------------------------------

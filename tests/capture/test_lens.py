@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from cleargs.capture import adjustment
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import set_cameras
+
+from .conftest import FOCAL, Ingest
 
 FRAMES, FEW = 12, 6
 FULL = [1280.0, 1330.0, 512.0, 384.0, -0.2, 0.2, 0.004, -0.003]
@@ -60,3 +63,14 @@ def test_few_frames_measure_the_lens(
     assert measured.num_reg_images() == FRAMES
     if changed:  # found: 0.12 % off; the model began 2 % off
         assert np.allclose(measured.cameras[1].params[:2], params[:2], rtol=4e-3)
+
+
+def test_a_wrong_focal_length_of_the_exif_is_left_out(images: Path, ingest: Ingest) -> None:
+    for path in images.iterdir():
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[41989] = 900  # 23 times the true one
+        Image.open(path).save(path, exif=exif.tobytes())
+    done = ingest(images)
+    assert done.result.summary["registered"] == 10
+    assert done.result.summary["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.05)
+    assert any("EXIF" in line for line in done.warnings)

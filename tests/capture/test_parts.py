@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from OpenImageIO import ImageOutput, ImageSpec
-from PIL import Image
+from PIL import Image, ImageOps
 from pydantic import ValidationError
 
 from cleargs.capture.cameras import Intrinsics, Pose, normalise, pinhole
@@ -519,3 +519,40 @@ def test_a_table_of_an_older_version_is_read(tmp_path: Path) -> None:
     assert rows == [{"a": 1, "b": None}, {"a": 2, "b": None}]
     with pytest.raises(StoreError, match=r"t\.parquet"):
         read_table(tmp_path / "t.parquet", pa.schema([*old, column("c", pa.string(), "needed")]))
+
+
+def turned_photo(path: Path, orientation: int, size: tuple[int, int]) -> None:
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.new("RGB", size).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("size", [(60, 40), (50, 50)])
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("form", ["a.png", "a.jpg.png"])
+def test_a_mask_turns_with_its_image_if_it_was_made_on_the_stored_pixels(
+    tmp_path: Path, size: tuple[int, int], orientation: int, form: str
+) -> None:
+    photo, mask = tmp_path / "a.jpg", tmp_path / form
+    turned_photo(photo, orientation, size)
+    stored = np.full(size[::-1], 255, np.uint8)
+    stored[: size[1] // 4, : size[0] // 3] = 0
+    tagged = Image.fromarray(stored)
+    tagged.getexif()[274] = orientation
+    upright = np.asarray(ImageOps.exif_transpose(tagged))
+    frame = SourceFrame("a.jpg", photo, mask=mask)
+    quarter = orientation >= 5 and size[0] != size[1]
+    for pixels, fits in ((stored, quarter or form == "a.jpg.png"), (upright, quarter or form == "a.png")):
+        cv2.imwrite(str(mask), pixels)
+        if fits:
+            found = read_stencil(frame)
+            assert found is not None and np.array_equal(found, upright)
+
+
+def test_colmap_leaves_other_libraries_in_order() -> None:
+    """Imported before numpy, pycolmap made a later save of Pillow abort."""
+    code = (
+        "import cleargs.capture.colmap\nfrom io import BytesIO\nfrom PIL import Image\n"
+        "Image.new('RGB', (64, 64)).save(BytesIO(), 'png')"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

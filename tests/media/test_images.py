@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from OpenImageIO import ImageOutput, ImageSpec
+from PIL import Image
 
 from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
@@ -117,3 +118,31 @@ def test_an_image_turns_with_its_transparency_or_stays(tmp_path: Path, orientati
         alpha = read_alpha(path, upright=upright)
         assert alpha is not None and np.array_equal(alpha, read_rgb(path, upright=upright)[..., 0])
     assert np.array_equal(read_rgb(path, upright=False)[..., :1], opaque)
+
+
+def rgba(grey: object, alpha: object) -> Image.Image:
+    return Image.fromarray(
+        np.dstack([np.broadcast_to(x, (4, 6)) for x in (grey, grey, grey, alpha)]).astype(np.uint8)
+    )
+
+
+LEFT = np.arange(6) < 3
+"""True in the left half."""
+
+
+@pytest.mark.parametrize(
+    ("grey", "alpha"),
+    [
+        (255, 255 * LEFT),  # white with the mask in its alpha
+        (0, 255 * LEFT),
+        (255 * LEFT, 255 * LEFT),  # white on nothing
+        (np.arange(24).reshape(4, 6) * 8 + 40, 255 * LEFT),  # a cut-out of the photograph
+        (255 * LEFT, 255),  # grey, with an alpha that says nothing
+        (255 * LEFT, 254),
+        (255 * LEFT, 255 * (np.arange(6) > 0)),  # its alpha is not the mask
+        (np.where(LEFT, 255, 0), np.where(LEFT, 0, 255)),  # black paint on nothing
+    ],
+)
+def test_a_mask_in_alpha_or_in_grey(tmp_path: Path, grey: object, alpha: object) -> None:
+    rgba(grey, alpha).save(tmp_path / "mask.png")
+    assert np.array_equal(read_mask(tmp_path / "mask.png") > 0, np.broadcast_to(LEFT, (4, 6)))

@@ -11,10 +11,11 @@ import OpenImageIO
 import pytest
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
+from PIL.TiffImagePlugin import IFDRational
 
 from cleargs.errors import InputError
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.media.image import image_size, read_alpha, read_rgb
+from cleargs.media.image import image_size, read_alpha, read_rgb, stated_focal
 
 P3_FROM_SRGB = np.array([[0.8225, 0.1774, 0.0], [0.0332, 0.9669, 0.0], [0.0171, 0.0724, 0.9108]])
 """Linear light, both with the white point D65."""
@@ -133,3 +134,108 @@ def test_half_a_photo(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(InputError, match="not an image that can be read"):
         read_rgb(path)
+
+
+def exif(tags: dict[int, object], orientation: int = 1) -> bytes:
+    """EXIF data with these tags in the table of the camera."""
+    made = Image.Exif()
+    made[274] = orientation
+    made.get_ifd(0x8769).update(tags)
+    return made.tobytes()
+
+
+EQUIVALENT = {41989: 26}
+"""FocalLengthIn35mmFilm."""
+
+
+def on_sensor(width: int | None, per_inch: int = 3000, mm: int = 30) -> dict[int, object]:
+    """Tags as Canon's DSLRs write them; ``width`` is the size that the camera gave the picture."""
+    size = {} if width is None else {40962: width, 40963: width * 2 // 3}
+    return {37386: IFDRational(mm, 1), 41486: IFDRational(per_inch, 1), 41488: 2, **size}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".avif", ".heic", ".hif"])
+def test_the_focal_length_of_every_format(tmp_path: Path, suffix: str) -> None:
+    if suffix in (".heic", ".hif"):
+        heif = pytest.importorskip("pillow_heif", reason="the extra cleargs[heif] is not installed")
+        heif.register_heif_opener()
+    path, kind = tmp_path / f"a{suffix}", "HEIF" if suffix == ".hif" else None
+    for tags, share in ((EQUIVALENT, 26 / 43.27 * 1.25), (on_sensor(4000), 30 / 25.4 * 3000 / 4000)):
+        Image.new("RGB", (320, 240)).save(path, kind, exif=exif(tags))
+        assert stated_focal(path) == pytest.approx(share, rel=1e-12)
+
+
+@pytest.mark.parametrize("times", [1, 4, 16])
+def test_a_reduced_photograph_keeps_its_focal_length(tmp_path: Path, times: int) -> None:
+    Image.new("RGB", (4000 // times, 2600 // times)).save(tmp_path / "a.jpg", exif=exif(on_sensor(4000)))
+    assert stated_focal(tmp_path / "a.jpg") == pytest.approx(0.8858, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {},
+        {41989: 0},
+        on_sensor(None),
+        on_sensor(400),
+        {**on_sensor(4000), 41488: 9},
+        {**on_sensor(4000), 41486: IFDRational(0, 0)},
+        {**on_sensor(4000), 37386: IFDRational(0, 1)},
+    ],
+)
+def test_a_focal_length_that_no_camera_has_is_none(tmp_path: Path, tags: dict[int, object]) -> None:
+    Image.new("RGB", (400, 260)).save(tmp_path / "a.jpg", exif=exif(tags))
+    assert stated_focal(tmp_path / "a.jpg") is None
+
+
+@pytest.mark.parametrize("name", ["sRGB", "Display P3 Gamut with sRGB Transfer", "Adobe RGB"])
+@pytest.mark.parametrize("wide", [False, True])
+def test_a_profile_counts_by_its_content(tmp_path: Path, name: str, wide: bool) -> None:
+    plain = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    profile = bytearray(display_p3() if wide else plain)
+    for entry in range(struct.unpack_from(">I", profile, 128)[0]):
+        kind, offset, size = struct.unpack_from(">4sII", profile, 132 + 12 * entry)
+        if kind == b"desc":  # one record of multiLocalizedUnicode; the text may use the old one's place only
+            text = name.encode("utf-16-be")[: size - 28]
+            record = struct.pack(">4s3I4s2I", b"mluc", 0, 1, 12, b"enUS", len(text), 28)
+            profile[offset : offset + size] = (record + text).ljust(size, b"\0")
+    stored = as_p3(stripes()) if wide else stripes()
+    Image.fromarray(stored).save(tmp_path / "a.png", icc_profile=bytes(profile))
+    off = np.abs(read_rgb(tmp_path / "a.png").astype(int) - stripes())
+    assert off.max() <= (4 if wide else 0)
+
+
+def test_a_grey_profile_is_converted(tmp_path: Path) -> None:
+    """Linear light, as some scanners store it."""
+    curve = struct.pack(">4sIII", b"curv", 0, 0, 0)
+    white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
+    start = 132 + 24
+    tags = struct.pack(">I", 2) + struct.pack(">4sII4sII", b"wtpt", start, 20, b"kTRC", start + 20, 16)
+    head = bytearray(128)
+    struct.pack_into(">I4xI4s4s4s", head, 0, start + 36, 0x02400000, b"mntr", b"GRAY", b"XYZ ")
+    head[36:40] = b"acsp"
+    struct.pack_into(">3i", head, 68, 63190, 65536, 54061)
+    profile = bytes(head) + tags + white + curve
+    Image.fromarray(np.full((8, 8), 55, np.uint8)).save(tmp_path / "a.png", icc_profile=profile)
+    expected = 255 * srgb_from_linear(np.array(55 / 255.0))
+    assert abs(int(read_rgb(tmp_path / "a.png")[0, 0, 0]) - expected) <= 2
+
+
+def test_a_photograph_for_3d_screens_is_its_first_picture(tmp_path: Path) -> None:
+    second = Image.fromarray(stripes()[::-1].copy())
+    Image.fromarray(stripes()).save(
+        tmp_path / "a.jpg", "MPO", save_all=True, append_images=[second], quality=95
+    )
+    assert np.abs(read_rgb(tmp_path / "a.jpg").astype(int) - stripes())[5:15, 4::16].max() < 12
+
+
+@pytest.mark.parametrize("suffix", [".avifs", ".heics"])
+def test_of_a_series_in_one_file_the_first_picture_is_read(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".heics":
+        heif = pytest.importorskip("pillow_heif", reason="the extra cleargs[heif] is not installed")
+        heif.register_heif_opener()
+    path, kind = tmp_path / f"a{suffix}", "HEIF" if suffix == ".heics" else "AVIF"
+    second = Image.fromarray(stripes()[::-1].copy())
+    Image.fromarray(stripes()).save(path, kind, save_all=True, append_images=[second], quality=95)
+    assert image_size(path) == (64, 40)
+    assert np.abs(read_rgb(path).astype(int) - stripes())[5:15, 4::16].max() < 12

@@ -6,6 +6,7 @@ import os
 import struct
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -227,6 +228,96 @@ def _write_display_matrix(path: Path, clockwise: int) -> None:
     start = data.index(b"tkhd") + 4
     assert data[start] == 0  # version 0: the matrix follows 40 bytes of other fields
     struct.pack_into(">9i", data, start + 40, *matrix)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shown"),
+    [
+        ((-1, 0, 0, 1), np.s_[:, ::-1]),  # selfies
+        ((1, 0, 0, -1), np.s_[::-1]),
+        ((0, 1, 1, 0), None),  # mirrored at the diagonal
+    ],
+)
+def test_a_mirrored_video(tmp_path: Path, matrix: tuple[int, ...], shown: Any) -> None:
+    path = tmp_path / "mirrored.mp4"
+    encode(path, bar_planes("bt709", False), codec="libx264", options={"crf": "4", "preset": "ultrafast"})
+    _, stored = next(decode_frames(path, read_timeline(path).pts[:1]))
+    data = bytearray(path.read_bytes())
+    a, b, c, d = (value << 16 for value in matrix)
+    struct.pack_into(">9i", data, data.index(b"tkhd") + 44, a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    _, made = next(decode_frames(path, read_timeline(path).pts[:1]))
+    assert np.array_equal(made, stored.swapaxes(0, 1) if shown is None else stored[shown])
+
+
+def clip_of_40(path: Path, b_frames: int) -> Path:
+    """40 frames in 4 s, a key frame in each second."""
+    options = {"preset": "ultrafast", "g": "10", "bf": str(b_frames), "sc_threshold": "0"}
+    encode(path, bar_planes("bt709", False), codec="libx264", pts=tuple(range(0, 360, 9)), options=options)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov"])
+@pytest.mark.parametrize("b_frames", [0, 2])
+@pytest.mark.parametrize(("start", "left"), [(1.55, 24), (0.3, 37), (2.0, 20)])
+def test_a_clip_that_was_cut_without_encoding(
+    tmp_path: Path, suffix: str, b_frames: int, start: float, left: int
+) -> None:
+    """As ``ffmpeg -ss START -i IN -c copy OUT`` does: from a key frame on, the frames before are hidden."""
+    whole, cut = clip_of_40(tmp_path / f"whole{suffix}", b_frames), tmp_path / f"cut{suffix}"
+    with av.open(whole) as source, av.open(cut, "w", options={"avoid_negative_ts": "disabled"}) as copy:
+        stream = source.streams.video[0]
+        assert stream.time_base is not None
+        target = copy.add_stream_from_template(stream)
+        source.seek(int(start * 1e6))
+        for packet in source.demux(stream):
+            if packet.dts is not None and packet.pts is not None:
+                packet.pts -= int(start / stream.time_base)
+                packet.dts -= int(start / stream.time_base)
+                packet.stream = target
+                copy.mux(packet)
+    timeline = read_timeline(cut)
+    assert abs(len(timeline.pts) - left) <= 1 and len(list(decode_frames(cut, timeline.pts))) >= left - 1
+
+
+@pytest.mark.parametrize(
+    ("edits", "left"),
+    [
+        ([(2.0, 0.0)], 20),  # the end was trimmed by a phone
+        ([(1.5, 1.2)], 15),
+        ([(1.0, 0.0), (1.0, 2.0)], 20),  # the middle was cut out
+        ([(0.5, -1.0), (1.0, 1.0)], 10),  # it begins late
+    ],
+)
+def test_a_clip_that_a_phone_trimmed(tmp_path: Path, edits: list[tuple[float, float]], left: int) -> None:
+    path = clip_of_40(tmp_path / "a.mp4", 0)
+    with av.open(path) as opened:
+        scale = 1 / opened.streams.video[0].time_base
+    write_edits(path, [(round(1000 * s), -1 if at < 0 else round(at * scale)) for s, at in edits])
+    assert len(read_timeline(path).pts) == left
+
+
+def write_edits(path: Path, edits: list[tuple[int, int]]) -> None:
+    """Put an edit list of (length, start in the media) into the only track of an MP4 file."""
+    data = bytearray(path.read_bytes())
+
+    def size(at: int) -> int:
+        return int(struct.unpack_from(">I", data, at)[0])
+
+    if (old := data.find(b"edts") - 4) >= 0:
+        change = -size(old)
+        del data[old : old - change]
+    else:
+        change = 0
+    entries = b"".join(struct.pack(">Iii", length, at, 1 << 16) for length, at in edits)
+    box = struct.pack(">I4sII", 16 + len(entries), b"elst", 0, len(edits)) + entries
+    box = struct.pack(">I4s", 8 + len(box), b"edts") + box
+    header = data.index(b"tkhd") - 4
+    data[header + size(header) : header + size(header)] = box
+    for name in (b"moov", b"trak"):
+        at = data.index(name) - 4
+        struct.pack_into(">I", data, at, size(at) + change + len(box))
     path.write_bytes(data)
 
 

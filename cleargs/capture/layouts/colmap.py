@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, SourceFrame
@@ -16,17 +18,19 @@ from cleargs.capture.folders import (
     frame_key,
     image_files,
     is_inside,
+    is_wanted,
     mask_externals,
     require_most,
 )
 from cleargs.capture.layouts import llff
 from cleargs.capture.layouts.llff import POSES_BOUNDS
+from cleargs.capture.model_text import image_lines
 from cleargs.errors import InputError
-from cleargs.safe_io import FAULTS, open_regular, read_text
+from cleargs.safe_io import FAULTS, open_regular
 
 
-def detect(source: Path, *, poses: bool) -> bool:
-    return poses and bool(_models(source))
+def detect(source: Path, config: CaptureConfig) -> bool:
+    return config.uses_poses and bool(_models(source))
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
@@ -37,9 +41,11 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
             images["beside_sparse"] = {path.name: path for path in image_files(source)}
         else:
             images[folder.name] = folder
-    if llff.detect(source, poses=True):
+    if llff.detect(source, config):
         images["poses_bounds"] = source / POSES_BOUNDS
-    return {**images, **mask_externals(source), "sparse": _largest(source)}
+    folder = _largest(source)
+    tables = {path.name: path for kind in ("bin", "txt") for path in source.glob(f"*.{kind}")}
+    return {**images, **mask_externals(source), "sparse": tables if folder == source else folder}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
@@ -57,7 +63,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         )
     root, paths, by_stem = find_images(source, list(posed))
     missing = [name for name in posed if name not in paths]
-    if 2 * len(missing) > len(posed) and llff.detect(source, poses=True):
+    if 2 * len(missing) > len(posed) and llff.detect(source, config):
         capture = llff.open_capture(source, config)
         note = (
             f"{len(missing)} of {len(posed)} images of the COLMAP model are missing: {POSES_BOUNDS} is read"
@@ -83,20 +89,31 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     for name, path in sorted({**stored, **paths}.items(), key=lambda item: frame_key(item[0])):
         image = posed.get(name)
         camera, pose = (None, None) if image is None else (model.cameras[image.camera_id], image.pose)
-        frames.append(SourceFrame(name, path, camera=camera, pose=pose))
+        if is_wanted(path, source, config):
+            frames.append(SourceFrame(name, path, camera=camera, pose=pose))
     taken = chosen(frames, source, config.max_frames)
-    sparse = model if len(model.point_ids) or model.dropped else None
+    views = Counter(chain.from_iterable(image.point_ids.tolist() for image in model.images.values()))
+    seen = any(count > 1 for count in views.values())
+    if len(model.point_ids) and not seen:
+        notes.append(
+            f"no two images see one of the {len(model.point_ids)} points of the COLMAP model, as RealityScan "
+            "and laser scanners export it: points are triangulated from the images"
+        )
+    sparse = model if seen or model.dropped else None
     return Capture("colmap", taken, len(frames), sparse, available=tuple(frames), notes=tuple(notes))
 
 
 def _models(root: Path) -> dict[Path, int]:
-    """Return the folders of sparse models with the number of images of each, ``sparse/0`` first."""
+    """Return the folders of sparse models with the number of images of each, ``sparse/0`` first.
+
+    Several programs write the model next to the images, or ``images`` and ``cameras`` alone.
+    """
     folders: list[Path] = []
     for sparse in (root / "sparse", root / "colmap" / "sparse"):
         if sparse.is_dir():
             folders += [*sorted(path for path in sparse.iterdir() if path.name.isdecimal()), sparse]
     found: dict[Path, int] = {}
-    for folder in folders:
+    for folder in (*folders, root):
         for kind in ("bin", "txt"):
             if (folder / f"images.{kind}").is_file():
                 found.setdefault(folder, _number_of_images(folder / f"images.{kind}"))
@@ -115,7 +132,6 @@ def _number_of_images(file: Path) -> int:
         if file.suffix == ".bin":
             with open_regular(file) as opened:
                 return int(struct.unpack("<Q", opened.read(8))[0])
-        lines = [line for line in read_text(file).splitlines() if not line.startswith("#")]
-        return sum(bool(line.strip()) for line in lines[::2])  # the second line of each has its keypoints
+        return len(image_lines(file))
     except FAULTS:
         return 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import chosen, image_files, image_folders, mask_externals
+from cleargs.capture.folders import chosen, image_files, image_folders, is_wanted, mask_externals
 from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, faults_as, open_regular
 
@@ -25,8 +25,8 @@ POSES_BOUNDS = "poses_bounds.npy"
 """LLFF's file of poses."""
 
 
-def detect(source: Path, *, poses: bool) -> bool:
-    return poses and (source / POSES_BOUNDS).is_file()
+def detect(source: Path, config: CaptureConfig) -> bool:
+    return config.uses_poses and (source / POSES_BOUNDS).is_file()
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
@@ -39,7 +39,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
 
     Frames have the order of the rows, because users of these data sets hold out every N-th row.
     """
-    frames = read_llff(source)
+    frames = [frame for frame in read_llff(source) if is_wanted(frame.path, source, config)]
     return Capture("llff", chosen(frames, source, config.max_frames), len(frames))
 
 

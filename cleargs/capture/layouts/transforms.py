@@ -16,6 +16,7 @@ from cleargs.capture.folders import (
     folders_to_search,
     frame_key,
     image_files,
+    is_wanted,
     mask_externals,
     name_below_images,
     require_most,
@@ -45,8 +46,8 @@ _SPLIT = tuple(f"transforms_{part}.json" for part in ("train", "test", "val"))
 """Blender's form: a file per part. The frames of test (of val if there is no test) are held out."""
 
 
-def detect(source: Path, *, poses: bool) -> bool:
-    """See `Layout.detect`. Even without ``poses`` the file counts, because it lists images."""
+def detect(source: Path, config: CaptureConfig) -> bool:
+    """See `Layout.detect`. The file counts even if its poses are not used, because it lists images."""
     return bool(_listings(source))
 
 
@@ -67,15 +68,20 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     notes: list[str] = []
     frames: list[SourceFrame] = []
     for file in files:
-        listed = read_transforms(file, poses=config.poses == "auto", notes=notes)
+        listed = read_transforms(file, poses=config.uses_poses, notes=notes)
         frames += [replace(frame, test=file != files[0]) for frame in listed]
     split = _split_files(source)
     if files == split[:2] and len(split) > 2:
         notes.append(f"{split[2].name} is not read: the test views are those of {split[1].name}")
+    others = {path for folder in {frame.path.parent for frame in frames} for path in image_files(folder)}
+    others -= {path for frame in frames for path in (frame.path, frame.mask)}
+    told = f"read: {len(frames)} pictures that {' and '.join(file.name for file in files)} lists"
+    told += f"; left out: {len(others)} others next to them" if others else ""
+    frames = [frame for frame in frames if is_wanted(frame.path, source, config)]
     frames.sort(key=lambda frame: frame_key(frame.name))
     names = [name_below_images(frame.name) for frame in frames]
     taken = chosen(frames, source, config.max_frames, names)
-    return Capture("transforms", taken, len(frames), available=tuple(frames), notes=tuple(notes))
+    return Capture("transforms", taken, len(frames), available=tuple(frames), told=told, notes=tuple(notes))
 
 
 def _split_files(source: Path) -> list[Path]:

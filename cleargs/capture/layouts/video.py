@@ -9,31 +9,36 @@ from typing import TYPE_CHECKING
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import folder_of_images, videos_in
+from cleargs.capture.contents import contents_of, media_files
 from cleargs.errors import InputError
+from cleargs.media import VIDEO_SUFFIXES
 
 if TYPE_CHECKING:
     from cleargs.media.video import Timeline
     from cleargs.types import ArrayF64
 
 
-def detect(source: Path, *, poses: bool) -> bool:
-    """See `Layout.detect`: a file, or a folder with videos and without images."""
-    return not source.is_dir() or (folder_of_images(source) is None and bool(videos_in(source)))
+def detect(source: Path, config: CaptureConfig) -> bool:
+    """See `Layout.detect`: a file, or a folder in which videos are the capture."""
+    if not source.is_dir():
+        return True
+    suffixes = {path.suffix.lower() for path in media_files(source)}
+    return bool(suffixes & VIDEO_SUFFIXES) and contents_of(source, config).is_video
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    videos = _videos(source)
+    videos = contents_of(source, config).videos if source.is_dir() else [source]
     if len(videos) == 1:
         return {"capture": videos[0]}
-    return {"capture": {video.name: video for video in videos}}
+    return {"capture": {name: video for video, name in _names(videos, source).items()}}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """See `Layout.open_capture`. Each video gets frames in proportion to its length."""
     from cleargs.media.video import read_timeline
 
-    videos = _videos(source)
+    contents = contents_of(source, config) if source.is_dir() else None
+    videos = list(contents.videos) if contents is not None else [source]
     whole = [read_timeline(video) for video in videos]
     timelines = [timeline.between(config.start, config.end) for timeline in whole]
     if not any(timeline.pts for timeline in timelines):
@@ -44,10 +49,10 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         )
     frames: list[SourceFrame] = []
     shares = _shares(timelines, config.max_frames)
-    stems = Counter(video.stem for video in videos)
+    stems, names = Counter(video.stem for video in videos), _names(videos, source)
     for video, timeline, at_most in zip(videos, timelines, shares, strict=True):
         if timeline.pts and at_most:
-            name = video.stem if stems[video.stem] == 1 else video.name
+            name = video.stem if stems[video.stem] == 1 else names[video]
             chosen = choose_times(timeline, config.fps, at_most)
             frames += [video_frame(video, timeline, index, name) for index in chosen]
     return Capture(
@@ -56,7 +61,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
         sum(len(timeline.pts) for timeline in timelines),
         hdr=next((timeline.transfer for timeline in whole if timeline.transfer), None),
         stretch=(config.start, config.end),
-        notes=tuple(_notes(videos, whole)),
+        told="" if contents is None else contents.told(),
+        notes=(*_notes(videos, whole), *(contents.warnings() if contents is not None else ())),
     )
 
 
@@ -81,8 +87,11 @@ def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[in
     return chosen if len(chosen) <= at_most else _nearest(times, np.linspace(0, span, at_most))
 
 
-def _videos(source: Path) -> list[Path]:
-    return videos_in(source) if source.is_dir() else [source]
+def _names(videos: Sequence[Path], source: Path) -> dict[Path, str]:
+    """Return video -> its path below the folder ``source``, or its name if it is the input itself."""
+    return {
+        video: video.relative_to(source).as_posix() if video != source else video.name for video in videos
+    }
 
 
 def _shares(timelines: Sequence[Timeline], at_most: int) -> list[int]:

@@ -1,0 +1,297 @@
+"""Contents of a folder: photographs, and what is next to them, by the headers of the files.
+
+RGB-D cameras and scanning apps write depth and confidence maps next to their photographs, phones split their
+photographs over folders, and exports have previews and reduced copies.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from filecmp import cmp
+from pathlib import Path
+
+from cleargs.capture.capture import External, SourceFrame
+from cleargs.capture.config import CaptureConfig
+from cleargs.capture.folders import frame_key, image_files, is_wanted, mask_externals, masks_of, natural_key
+from cleargs.errors import InputError
+from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
+from cleargs.media.headers import Header, lacks_package, read_header
+
+FEWEST = 3
+"""A folder with fewer photographs is read as something else, if it has something else."""
+
+_SMALL, _FEW = 0.5, 0.25
+"""Pictures whose long side is at most this share of the others' are previews if they are at most this share
+of their number, or if they have the numbers of others in their names."""
+
+_REDUCED = 0.75  # share of the long side up to which a folder with the names of another one has copies
+
+_SYSTEM = re.compile(r"[.@#]|__MACOSX$")  # start of the names of hidden folders and of those of network disks
+_MASK_FOLDER = re.compile(r"masks?", re.IGNORECASE)
+_MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]masks?)?", re.IGNORECASE)
+_PROCESSED = re.compile(r"correct|undist|rectif|edit|resiz|enhanc", re.IGNORECASE)
+_PREVIEW_NAME = re.compile(r"thumb|preview|poster|contact.?sheet", re.IGNORECASE)
+
+MASKS, DEPTH, GREY = "mask%s", "depth map%s", "picture%s of one channel"
+VIDEOS, RAW, UNREADABLE = "video%s", "raw or other picture%s", "HEIC picture%s without pillow-heif"
+PREVIEWS, COPIES, OUTSIDE = (
+    "preview%s",
+    "second picture%s, reduced or in another format",
+    "picture%s outside images/",
+)
+PHOTOGRAPHS, UNWANTED = "photograph%s", "file%s by --only or --skip"
+_HINTS = {
+    VIDEOS: "photographs are taken; for the videos, give one as the input, or set --skip for the photographs",
+    RAW: "convert them to JPEG or PNG",
+    UNREADABLE: "pip install 'cleargs[heif]', or convert them to JPEG",
+}
+"""Reason -> remedy, where the user may have expected that the files are used."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The media files below a folder."""
+
+    root: Path
+    photographs: Sequence[Path]
+    """The pictures that show the scene, in the order of their names (`frame_key`)."""
+    videos: Sequence[Path]
+    """The videos in the folder itself, else all below it, in natural order."""
+    masks: Mapping[Path, Path]
+    """Photograph -> its mask. Those of ``masks/`` at the usual places are not here."""
+    left_out: Mapping[str, Sequence[Path]]
+    """Kind -> files that are not taken."""
+    is_video: bool
+    """True if the videos are the capture, not the photographs."""
+
+    @property
+    def folder(self) -> Path:
+        """The lowest folder with all photographs: their names are relative to it."""
+        parents = {path.parent for path in self.photographs}
+        return Path(os.path.commonpath(parents)) if parents else self.root
+
+    def frames(self) -> list[SourceFrame]:
+        """Return the photographs as frames, with the masks of `masks`."""
+        folder = self.folder
+        names = {path: path.relative_to(folder).as_posix() for path in self.photographs}
+        return [SourceFrame(name, path, mask=self.masks.get(path)) for path, name in names.items()]
+
+    def externals(self) -> dict[str, External]:
+        """Return photographs and masks by role (`Layout.externals`)."""
+        folder = self.folder
+        role = "capture" if folder == self.root else "images"
+        found: dict[str, External] = {role: folder, **mask_externals(self.root)}
+        if len(self.photographs) != len(image_files(folder)):
+            found[role] = {path.relative_to(folder).as_posix(): path for path in self.photographs}
+        if self.masks:
+            found["masks_beside"] = {m.relative_to(self.root).as_posix(): m for m in self.masks.values()}
+        return found
+
+    def told(self) -> str:
+        """Return one line on what is taken, from which folders, and what is left out."""
+        counted = {kind: self._counted(kind, files) for kind, files in self.left_out.items() if files}
+        masks = counted.pop(MASKS, None)
+        kind, taken = (VIDEOS, self.videos) if self.is_video else (PHOTOGRAPHS, self.photographs)
+        line = " and ".join(filter(None, ["read: " + self._counted(kind, taken), masks]))
+        return f"{line}; left out: {', '.join(counted.values())}" if counted else line
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return a line for each kind of files that the user may miss, with the remedy."""
+        return tuple(
+            f"left out: {self._counted(kind, files)}; {_HINTS[kind]}"
+            for kind, files in self.left_out.items()
+            if files and kind in _HINTS
+        )
+
+    def _counted(self, kind: str, files: Sequence[Path]) -> str:
+        """Return the number of ``files`` with their names (up to three), or else with their folders."""
+        if len(files) <= 3:
+            places = [path.relative_to(self.root).as_posix() for path in files]
+        else:
+            folders = Counter(path.parent.relative_to(self.root).as_posix() for path in files)
+            only = len(folders) == 1
+            places = [f"{folder}/" if only else f"{folder}/ {count}" for folder, count in folders.items()]
+            places = [] if places == ["./"] else [*places[:4], *(["..."] if len(places) > 4 else [])]
+        names = f" ({', '.join(places)})" if places else ""
+        return f"{len(files)} {kind % ('' if len(files) == 1 else 's')}{names}"
+
+
+def contents_of(root: Path, config: CaptureConfig) -> Contents:
+    """Return the media files below ``root``, sorted by what their headers say. Decodes no picture.
+
+    Raises InputError if ``ingest.only`` and ``ingest.skip`` leave nothing.
+    """
+    found = media_files(root)
+    wanted = [path for path in found if is_wanted(path, root, config)]
+    if found and not wanted:
+        raise InputError(
+            f"ingest.only and ingest.skip leave out all {len(found)} pictures and videos of {root}",
+            hint="give names, folders or patterns as they are below the input: 'cam0', 'shots/*', '*.png'",
+        )
+    left_out: dict[str, Sequence[Path]] = {UNWANTED: sorted(set(found) - set(wanted))}
+    videos = [path for path in wanted if path.suffix.lower() in VIDEO_SUFFIXES]
+    videos = [path for path in videos if path.parent == root] or videos
+    videos.sort(key=lambda path: natural_key(path.relative_to(root).as_posix()))
+    left_out[RAW] = [path for path in wanted if path.suffix.lower() in RAW_SUFFIXES]
+    images = [path for path in wanted if path.suffix.lower() in IMAGE_SUFFIXES]
+    left_out[UNREADABLE] = [path for path in images if lacks_package(path)]
+    if len(left_out[UNREADABLE]) == len(images):  # reading the first one names the remedy
+        left_out[UNREADABLE] = []
+    images = _without(images, left_out[UNREADABLE])
+    inside = {path for path in images if path.parts[len(root.parts)] == "images" and path.parent != root}
+    if inside:
+        # The place of the images in all layouts: what is elsewhere was put there on purpose.
+        left_out[OUTSIDE] = [p for p in images if p not in inside and not _mask_folder(p, root)]
+        images = _without(images, left_out[OUTSIDE])
+    left_out[MASKS] = _masks(images, root)
+    headers = {path: read_header(path) for path in _without(images, left_out[MASKS])}
+    images, left_out[DEPTH], left_out[GREY] = _by_channels(headers)
+    left_out[PREVIEWS] = _previews(images, headers)
+    images = _without(images, left_out[PREVIEWS])
+    left_out[COPIES] = _copies(images, headers)
+    images = _without(images, left_out[COPIES])
+    only_maps = any(header and header.deep for header in headers.values())
+    only_maps &= all(_is_grey(headers[path]) for path in images)
+    is_video = bool(videos) and (len(images) < FEWEST or only_maps)
+    left_out[PHOTOGRAPHS if is_video else VIDEOS] = images if is_video else videos
+    images.sort(key=lambda path: frame_key(path.relative_to(root).as_posix()))
+    made = Contents(root, images, videos, {}, left_out, is_video)
+    return replace(made, masks=_paired(made, left_out[MASKS]))
+
+
+def media_files(root: Path) -> list[Path]:
+    """Return pictures and videos below ``root``, without hidden ones and those of runs."""
+    found = []
+    suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
+    for folder, folders, names in os.walk(root, followlinks=True):
+        below = [name for name in sorted(folders) if not _SYSTEM.match(name)]
+        folders[:] = [name for name in below if not Path(folder, name, "run.toml").is_file()]
+        paths = [Path(folder, name) for name in sorted(names) if not name.startswith(".")]
+        found += [path for path in paths if path.suffix.lower() in suffixes and path.is_file()]
+    return found
+
+
+def _without(files: Sequence[Path], others: Sequence[Path]) -> list[Path]:
+    gone = set(others)
+    return [path for path in files if path not in gone]
+
+
+def _mask_folder(path: Path, root: Path) -> Path | None:
+    """Return the folder of masks below ``root`` that has the file ``path``, or None."""
+    depth = len(root.parts)
+    found = (n for n, part in enumerate(path.parts[depth:-1], depth) if _MASK_FOLDER.fullmatch(part))
+    return next((Path(*path.parts[: n + 1]) for n in found), None)
+
+
+def _unmasked(path: Path) -> Path:
+    """Return ``path`` without its ending and without the word "mask" at either end of its name."""
+    found = _MASK_NAME.fullmatch(path.stem)
+    return path.with_name(found[1] if found else path.stem)
+
+
+def _masks(images: Sequence[Path], root: Path) -> list[Path]:
+    """Return the masks among ``images``, by their folders and names. If all would be masks, none is one."""
+    stems = {path.with_suffix("") for path in images}
+    masks = [
+        path
+        for path in images
+        if _mask_folder(path, root) or (_unmasked(path) != path.with_suffix("") and _unmasked(path) in stems)
+    ]
+    return masks if len(masks) < len(images) else []
+
+
+def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
+    """Return photograph -> its mask, in a folder of masks or next to it (``NAME_mask.png``)."""
+    by_stem = {path.with_suffix(""): path for path in contents.photographs}
+    root = contents.folder
+    names = {path.relative_to(root).as_posix(): path for path in contents.photographs}
+    found = {by_stem[_unmasked(mask)]: mask for mask in masks if _unmasked(mask) in by_stem}
+    for folder in dict.fromkeys(_mask_folder(mask, contents.root) for mask in masks):
+        if folder is not None:
+            found |= {names[name]: mask for name, mask in masks_of(folder, list(names)).items()}
+    return found
+
+
+def _is_grey(header: Header | None) -> bool:
+    return header is not None and (header.grey or header.deep)
+
+
+def _by_channels(headers: Mapping[Path, Header | None]) -> tuple[list[Path], list[Path], list[Path]]:
+    """Return photographs, depth maps, and pictures of one channel that are neither.
+
+    The photographs are the pictures in colour, or all grey ones if there are almost no others.
+    """
+    deep = [path for path, header in headers.items() if header is not None and header.deep]
+    grey = [path for path, header in headers.items() if header is not None and header.grey]
+    colour = _without(_without(list(headers), deep), grey)
+    if len(colour) >= FEWEST or not (grey or deep):
+        return colour, deep, grey
+    return ([*colour, *grey], deep, []) if grey else ([*colour, *deep], [], [])
+
+
+def _previews(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> list[Path]:
+    """Return pictures that are much smaller than the others, or have names of previews, and are few.
+
+    Small ones that are numbered like the others need not be few.
+    """
+    sizes = {path: header.size for path in images if (header := headers[path]) is not None}
+    counts = Counter(sizes.values())
+    if not counts:
+        return []
+    main = max(counts, key=lambda size: (counts[size] * size[0] * size[1], size))
+    others = [path for path, size in sizes.items() if max(size) > _SMALL * max(main)]
+    numbers = {(path.parent, *re.findall(r"\d+", path.stem)) for path in others}
+    small = [path for path in sizes if max(sizes[path]) <= _SMALL * max(main)]
+    paired = [path for path in small if (path.parent, *re.findall(r"\d+", path.stem)) in numbers]
+    found = small if len(small) <= _FEW * len(others) else paired
+    named = [path for path in others if _PREVIEW_NAME.search(path.stem)]
+    return sorted({*found, *(named if len(named) <= _FEW * len(others) else [])})
+
+
+def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> list[Path]:
+    """Return pictures of folders that have the names of another folder in a smaller size or another format.
+
+    Second copies in one folder (``IMG_1.HEIC`` next to ``IMG_1.JPG``) count too.
+    """
+    stems: dict[Path, Path] = {}
+    second = [path for path in images if stems.setdefault(path.with_suffix(""), path) is not path]
+    folders: dict[Path, dict[str, Path]] = defaultdict(dict)
+    for path in _without(images, second):
+        folders[path.parent][path.stem.lower()] = path
+    kept: list[dict[str, Path]] = []
+
+    def rank(folder: Path) -> tuple[bool, int]:
+        pixels = sum(_pixels(headers[path]) for path in folders[folder].values())
+        return bool(_PROCESSED.search(folder.name)), -pixels
+
+    for folder in sorted(folders, key=rank):
+        files = folders[folder]
+        if any(
+            all(name in other and _is_copy(path, other[name], headers) for name, path in files.items())
+            for other in kept
+        ):
+            second += files.values()
+        else:
+            kept.append(files)
+    return second
+
+
+def _pixels(header: Header | None) -> int:
+    return 0 if header is None else header.size[0] * header.size[1]
+
+
+def _is_copy(path: Path, other: Path, headers: Mapping[Path, Header | None]) -> bool:
+    """Return True if ``path`` is ``other`` in a smaller size, processed, in another format, or as it is."""
+    own, its = headers[path], headers[other]
+    if own is None or its is None:
+        return False
+    (w, h), (width, height) = own.size, its.size
+    alike = abs(w * height - h * width) <= max(width, height) + max(w, h)
+    smaller = max(w, h) <= _REDUCED * max(width, height)
+    processed = bool(_PROCESSED.search(path.parent.name))
+    changed = smaller or processed or path.suffix.lower() != other.suffix.lower()
+    return alike and (changed or cmp(path, other, shallow=False))

@@ -1,0 +1,210 @@
+"""Folders as apps and cameras write them, from their public descriptions: one function per app.
+
+Each takes a folder, the pictures (BGR) and their poses (camera to world, OpenCV axes), and writes the files
+of the app. Depth and confidence maps are noise: their headers are what counts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import TypeAlias
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from .conftest import FOCAL, HEIGHT, WIDTH
+
+Poses: TypeAlias = Sequence[NDArray[np.float64]]
+Pictures: TypeAlias = Sequence[NDArray[np.uint8]]
+Writer: TypeAlias = Callable[[Path, Pictures, Poses], None]
+
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From OpenCV's axes of a camera to those of OpenGL and ARKit, and back."""
+
+
+def save(path: Path, picture: NDArray[np.generic]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), picture)
+
+
+def depth(path: Path, seed: int = 0) -> None:
+    """A depth map in millimetres, as small as a phone's: 16 bits, one channel."""
+    save(path, np.random.default_rng(seed).integers(500, 4000, (48, 64)).astype(np.uint16))
+
+
+def confidence(path: Path) -> None:
+    save(path, np.random.default_rng(0).integers(0, 3, (48, 64)).astype(np.uint8))
+
+
+def words(*numbers: object) -> str:
+    return " ".join(str(number) for number in numbers)
+
+
+def translation_and_quaternion(pose: NDArray[np.float64]) -> list[float]:
+    """x, y, z, qx, qy, qz, qw."""
+    return [*pose[:3, 3].tolist(), *Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()]
+
+
+def tum(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """TUM RGB-D: lists of pictures by time, and a motion capture at its own times."""
+    names, track = ["# color images"], ["# timestamp tx ty tz qx qy qz qw"]
+    for index, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+        time = 1305031102.175304 + index / 30
+        save(root / f"rgb/{time:.6f}.png", picture)
+        depth(root / f"depth/{time + 0.005:.6f}.png", index)
+        names.append(f"{time:.6f} rgb/{time:.6f}.png")
+        track.append(words(f"{time - 0.004:.4f}", *translation_and_quaternion(pose)))
+    (root / "rgb.txt").write_text("\n".join(names))
+    (root / "groundtruth.txt").write_text("\n".join(track))
+
+
+def rtabmap(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """RTAB-Map's export of pictures; its poses may be those of a robot, and are not read."""
+    for index, picture in enumerate(pictures):
+        save(root / f"room_rgb/{index + 1}.jpg", picture)
+        depth(root / f"room_depth/{index + 1}.png")
+
+
+def nerfcapture(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """NeRFCapture, without its transforms.json."""
+    for index, picture in enumerate(pictures):
+        save(root / f"images/{index}.png", picture)
+        depth(root / f"images/{index}.depth.png")
+
+
+def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Stray Scanner."""
+    root.mkdir(parents=True)
+    with av.open(root / "rgb.mp4", "w") as video:
+        stream = video.add_stream("libx264", rate=10, options={"crf": "10", "preset": "ultrafast"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for index, picture in enumerate(pictures):
+            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+            frame.pts, frame.time_base = index, Fraction(1, 10)
+            video.mux(stream.encode(frame))
+        video.mux(stream.encode(None))
+    (root / "camera_matrix.csv").write_text("\n".join(", ".join(map(str, row)) for row in K.tolist()))
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for index, pose in enumerate(poses):
+        depth(root / f"depth/{index:06d}.png", index)
+        confidence(root / f"confidence/{index:06d}.png")
+        lines.append(", ".join(map(str, [index / 10, f"{index:06d}", *translation_and_quaternion(pose)])))
+    (root / "odometry.csv").write_text("\n".join(lines))
+
+
+def polycam(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Polycam's raw data."""
+    save(root / "thumbnail.jpg", cv2.resize(pictures[0], (WIDTH, HEIGHT)))
+    for index, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+        name = str(98765432100 + 333 * index)
+        save(root / f"keyframes/images/{name}.jpg", picture)
+        save(root / f"keyframes/corrected_images/{name}.jpg", picture)
+        depth(root / f"keyframes/depth/{name}.png")
+        confidence(root / f"keyframes/confidence/{name}.png")
+        matrix = pose @ OPENGL
+        data = {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
+        data |= {
+            "fx": FOCAL,
+            "fy": FOCAL,
+            "cx": WIDTH / 2,
+            "cy": HEIGHT / 2,
+            "width": WIDTH,
+            "height": HEIGHT,
+        }
+        for folder in ("cameras", "corrected_cameras"):
+            (root / "keyframes" / folder).mkdir(exist_ok=True)
+            (root / "keyframes" / folder / f"{name}.json").write_text(json.dumps(data))
+
+
+def record3d(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Record3D's export of pictures and depth (EXR)."""
+    quaternions = []
+    for index, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+        save(root / f"rgb/{index}.jpg", picture)
+        (root / "depth").mkdir(exist_ok=True)
+        (root / f"depth/{index}.exr").write_bytes(b"\x76\x2f\x31\x01")
+        x = translation_and_quaternion(pose @ OPENGL)
+        quaternions.append([*x[3:], *x[:3]])
+    data = {"w": WIDTH, "h": HEIGHT, "fps": 60, "K": K.T.ravel().tolist(), "poses": quaternions}
+    (root / "metadata.json").write_text(json.dumps(data))
+
+
+def scanner_app(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """3D Scanner App, "all data": everything in one folder."""
+    for index, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+        save(root / f"frame_{index:05d}.jpg", picture)
+        save(root / f"thumb_{index:05d}.jpg", cv2.resize(picture, (80, 60)))
+        depth(root / f"depth_{index:05d}.png")
+        confidence(root / f"conf_{index:05d}.png")
+        data = {"cameraPoseARFrame": (pose @ OPENGL).ravel().tolist(), "intrinsics": K.ravel().tolist()}
+        (root / f"frame_{index:05d}.json").write_text(json.dumps(data))
+    (root / "info.json").write_text("{}")
+
+
+def scannet(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """ScanNet, after its SensReader. Tracking was lost in the last frame."""
+    for folder in ("intrinsic", "pose"):
+        (root / folder).mkdir(parents=True)
+    camera = np.eye(4)
+    camera[:3, :3] = K
+    (root / "intrinsic/intrinsic_color.txt").write_text("\n".join(words(*row) for row in camera))
+    for index, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+        save(root / f"color/{index}.jpg", picture)
+        depth(root / f"depth/{index}.png")
+        lost = np.full((4, 4), -np.inf) if index == len(poses) - 1 else pose
+        (root / f"pose/{index}.txt").write_text("\n".join(words(*row) for row in lost))
+
+
+def seven_scenes(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Microsoft's 7-Scenes: everything in one folder, no camera."""
+    for index, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+        name = f"frame-{index:06d}"
+        save(root / f"{name}.color.png", picture)
+        depth(root / f"{name}.depth.png")
+        (root / f"{name}.pose.txt").write_text("\n".join("\t".join(map(str, row)) for row in pose))
+
+
+def iphone(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A phone's card after photograph 9999."""
+    for index, picture in enumerate(pictures):
+        number = 9996 + index if index < 4 else index - 3
+        folder = "100APPLE" if index < 4 else "101APPLE"
+        save(root / f"DCIM/{folder}/IMG_{number:04d}.JPG", picture)
+
+
+def two_cameras(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A rig whose cameras have a folder each."""
+    for index, picture in enumerate(pictures):
+        save(root / f"images/cam{index % 2}/{index // 2:04d}.png", picture)
+
+
+def reduced_copies(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Folders of photographs, of small copies for the web, and of the same in another format."""
+    for index, picture in enumerate(pictures):
+        save(root / f"full/{index:04d}.jpg", picture)
+        save(root / f"tiff/{index:04d}.tif", picture)
+        save(root / f"web/{index:04d}.jpg", cv2.resize(picture, (WIDTH // 2, HEIGHT // 2)))
+        save(root / f"thumbs/{index:04d}.jpg", cv2.resize(picture, (32, 24)))
+
+
+def masks_beside(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Masks next to their photographs, some in colour, as several programs save them."""
+    for index, picture in enumerate(pictures):
+        save(root / f"{index:04d}.jpg", picture)
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:60] = 0
+        save(root / f"{index:04d}_mask.png", mask if index % 2 else cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
+
+
+def previews_at_the_top(root: Path, pictures: Pictures, poses: Poses) -> None:
+    for index, picture in enumerate(pictures):
+        save(root / f"shots/{index:04d}.jpg", picture)
+    for index in range(2):
+        save(root / f"cover_{index}.jpg", cv2.resize(pictures[index], (96, 72)))

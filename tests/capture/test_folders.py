@@ -1,0 +1,303 @@
+"""Folders as people drop them on the program: what is read, with which poses, and what is left out."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from cleargs.capture.choice import select_sharp_frames
+from cleargs.capture.prepare import read_stencil
+from cleargs.capture.sources import externals, open_capture, whole_capture
+from cleargs.errors import InputError
+from cleargs.progress import SilentReporter
+from cleargs.stages.ingest import IngestConfig
+
+from . import apps
+from .conftest import FOCAL, Ingest
+
+Frames = Sequence[tuple[NDArray[np.float64], NDArray[np.uint8]]]
+
+
+def write(app: apps.Writer, root: Path, frames: Frames) -> Path:
+    app(root, [image for _, image in frames], [pose for pose, _ in frames])
+    return root
+
+
+READ: dict[str, tuple[apps.Writer, int, str]] = {
+    "TUM": (apps.tum, 10, "left out: 10 depth maps (depth/)"),
+    "RTAB-Map": (apps.rtabmap, 10, "left out: 10 depth maps (room_depth/)"),
+    "NeRFCapture": (apps.nerfcapture, 10, "left out: 10 depth maps (images/)"),
+    "Stray Scanner": (apps.stray, 10, "10 poses of Stray Scanner"),
+    "Polycam": (apps.polycam, 10, "1 preview (thumbnail.jpg)"),
+    "Record3D": (apps.record3d, 10, "10 poses of Record3D"),
+    "3D Scanner App": (apps.scanner_app, 10, "10 previews"),
+    "ScanNet": (apps.scannet, 10, "10 depth maps (depth/)"),
+    "7-Scenes": (apps.seven_scenes, 10, "10 depth maps"),
+    "DCIM": (apps.iphone, 10, "10 photographs (DCIM/100APPLE/ 4, DCIM/101APPLE/ 6)"),
+    "rig": (apps.two_cameras, 10, "10 photographs (images/cam0/ 5, images/cam1/ 5)"),
+    "copies": (apps.reduced_copies, 10, "in another format (tiff/ 10, web/ 10, thumbs/ 10)"),
+    "masks": (apps.masks_beside, 10, "10 masks"),
+    "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
+}
+
+
+@pytest.mark.parametrize("app", READ)
+def test_photographs_are_read_and_the_rest_is_told(tmp_path: Path, frames: Frames, app: str) -> None:
+    writer, count, told = READ[app]
+    root = write(writer, tmp_path / "capture", frames)
+    for poses in ("auto", "sfm"):
+        capture = open_capture(root, IngestConfig(poses=poses))
+        assert len(capture.frames) == capture.n_available == count
+        assert poses == "sfm" or told in capture.told
+        depths = ("depth", "conf", "thumb", "mask", "cover", "web")
+        assert not any(word in frame.name for frame in capture.frames for word in depths)
+        named = externals(root, IngestConfig(poses=poses)).values()
+        files = {p for place in named for p in (place.values() if isinstance(place, dict) else [place])}
+        assert all({f.path, *f.path.parents} & files for f in capture.frames)
+
+
+@pytest.mark.parametrize(
+    "app", ["TUM", "Stray Scanner", "Polycam", "Record3D", "3D Scanner App", "ScanNet", "7-Scenes"]
+)
+def test_poses_of_apps_are_those_planted(tmp_path: Path, frames: Frames, app: str) -> None:
+    capture = open_capture(write(READ[app][0], tmp_path / "capture", frames), IngestConfig())
+    assert capture.kind == "rgbd" and capture == select_sharp_frames(capture, 64, SilentReporter())
+    for frame, (pose, _) in zip(capture.frames, frames, strict=True):
+        if app == "ScanNet" and frame is capture.frames[-1]:
+            assert frame.pose is None
+            continue
+        assert frame.pose is not None
+        world_to_camera = np.linalg.inv(pose)
+        assert np.allclose(frame.pose.rotation, world_to_camera[:3, :3], atol=1e-6)
+        assert np.allclose(frame.pose.translation, world_to_camera[:3, 3], atol=1e-6)
+        if app not in ("TUM", "7-Scenes"):
+            assert frame.camera is not None and np.allclose(frame.camera.focal, FOCAL)
+
+
+@pytest.mark.parametrize("app", ["Stray Scanner", "Polycam", "7-Scenes"])
+def test_apps_are_ingested_with_their_poses(tmp_path: Path, frames: Frames, ingest: Ingest, app: str) -> None:
+    done = ingest(write(READ[app][0], tmp_path / "capture", frames))
+    assert done.result.summary["registered"] == 10 and READ[app][2] in done.result.summary["input"]
+    assert done.result.summary["poses"] in ("input", "refined")
+    assert done.result.summary["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.03)
+
+
+def test_rtabmap_is_placed_by_its_pictures(tmp_path: Path, frames: Frames, ingest: Ingest) -> None:
+    done = ingest(write(apps.rtabmap, tmp_path / "capture", frames))
+    assert done.result.summary["registered"] == 10 and done.result.summary["poses"] == "sfm"
+
+
+@pytest.mark.parametrize(
+    ("app", "file", "text"),
+    [
+        ("TUM", "groundtruth.txt", "1305031102.17 1 2"),
+        ("Stray Scanner", "odometry.csv", "a\n1, 2, x"),
+        ("Stray Scanner", "camera_matrix.csv", "1 2"),
+        ("Record3D", "metadata.json", "{}"),
+        ("ScanNet", "pose/3.txt", "1 0 0"),
+        ("3D Scanner App", "frame_00003.json", "[]"),
+    ],
+)
+def test_damaged_poses_of_apps(tmp_path: Path, frames: Frames, app: str, file: str, text: str) -> None:
+    root = write(READ[app][0], tmp_path / "capture", frames)
+    (root / file).write_text(text)
+    capture = open_capture(root, IngestConfig())
+    assert len(capture.frames) == 10 and not capture.posed
+    assert any(f"cannot read the poses of {app}" in note or "the pose of" in note for note in capture.notes)
+    assert not open_capture(root, IngestConfig(poses="sfm")).notes
+
+
+def test_masks_beside_their_photographs_are_used(tmp_path: Path, frames: Frames) -> None:
+    root = write(apps.masks_beside, tmp_path / "capture", frames)
+    for frame in open_capture(root, IngestConfig()).frames:
+        stencil = read_stencil(frame)
+        assert stencil is not None and not stencil[:60].any() and stencil[60:].all()
+    assert len(externals(root, IngestConfig())["masks_beside"]) == 10
+
+
+@pytest.mark.parametrize(
+    ("settings", "left"),
+    [
+        ({"only": "cam0"}, 5),
+        ({"skip": "images/cam0"}, 5),
+        ({"only": "images/cam1/*"}, 5),
+        ({"only": "0001.png, cam0/0002.png, 0000.*"}, 4),
+        ({"only": "cam0", "skip": "0000.png"}, 4),
+    ],
+)
+def test_files_by_choice(tmp_path: Path, frames: Frames, settings: dict[str, str], left: int) -> None:
+    root = write(apps.two_cameras, tmp_path / "capture", frames)
+    capture = open_capture(root, IngestConfig.model_validate(settings))
+    assert len(capture.frames) == left and f"{10 - left} files by --only or --skip" in capture.told
+
+
+def test_listed_files_by_choice(posed: Path) -> None:
+    capture = open_capture(posed, IngestConfig(skip="00[0-3].png"))
+    assert [frame.name for frame in capture.frames] == [f"images/{index:03d}.png" for index in range(4, 10)]
+
+
+def test_a_choice_of_nothing(images: Path) -> None:
+    with pytest.raises(InputError, match="leave out all 10"):
+        open_capture(images, IngestConfig(only="cam7"))
+
+
+def test_no_name_is_there_twice(tmp_path: Path, frames: Frames) -> None:
+    for app in READ:
+        root = write(READ[app][0], tmp_path / app, frames)
+        names = [frame.name for frame in open_capture(root, IngestConfig()).frames]
+        assert len(names) == len(set(names))
+
+
+def test_grey_photographs_are_photographs(images: Path) -> None:
+    for path in images.iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    assert len(open_capture(images, IngestConfig()).frames) == 10
+
+
+def test_photographs_of_a_thermal_camera_have_16_bits(images: Path) -> None:
+    for path in images.iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * 257)
+    assert len(open_capture(images, IngestConfig()).frames) == 10
+
+
+def test_two_lenses_of_a_phone_stay(images: Path) -> None:
+    """Half the size, but as many, and other pictures."""
+    for index, path in enumerate(sorted(images.iterdir())):
+        if index % 2:
+            cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), None, fx=0.5, fy=0.5))
+    assert len(open_capture(images, IngestConfig()).frames) == 10
+
+
+def test_a_run_in_the_folder_is_no_photograph(images: Path, frames: Frames) -> None:
+    for index, (_, image) in enumerate(reversed(frames)):
+        apps.save(images / f"room/ingest/images/view{index}.png", image)
+    assert len(open_capture(images, IngestConfig()).frames) == 20
+    (images / "room" / "run.toml").touch()
+    assert len(open_capture(images, IngestConfig()).frames) == 10
+
+
+@pytest.mark.parametrize("name", [".thumbnails", "@eaDir", "__MACOSX", "#recycle"])
+def test_folders_of_systems_are_not_read(images: Path, name: str) -> None:
+    shutil.copytree(images, images.parent / "copy")
+    shutil.move(images.parent / "copy", images / name)
+    capture = open_capture(images, IngestConfig())
+    assert len(capture.frames) == 10 and capture.told == "read: 10 photographs"
+
+
+def test_formats_that_need_a_package_are_left_out_with_a_warning(
+    images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cleargs.media.headers.find_spec", lambda name: None)
+    for index in range(3):
+        (images / f"IMG_{index}.HIF").write_bytes(b"\0\0\0\x18ftypheic" + bytes(12))
+    capture = open_capture(images, IngestConfig())
+    assert len(capture.frames) == 10
+    assert any("3 HEIC pictures" in note and "cleargs[heif]" in note for note in capture.notes)
+
+
+def test_live_photographs_in_two_formats_are_taken_once(images: Path) -> None:
+    for path in list(images.iterdir()):
+        Image.open(path).save(path.with_suffix(".jpg"))
+    capture = open_capture(images, IngestConfig())
+    assert len(capture.frames) == 10 and "10 second pictures" in capture.told
+
+
+PARTS = [
+    "transforms.json",
+    "images/003.png",
+    "sparse",
+    "sparse/0",
+    "sparse/0/cameras.bin",
+    "sparse/0/points3D.bin",
+    "database.db",
+    "colmap/sparse/0/images.txt",
+    "poses_bounds.npy",
+]
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_file_of_a_capture_stands_for_it(posed: Path, part: str) -> None:
+    if not (posed / part).exists():
+        file = posed / (part if Path(part).suffix else f"{part.removesuffix('/0')}/0/cameras.bin")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    assert whole_capture(posed / part) == posed
+
+
+def test_other_files_and_folders_stand_for_themselves(tmp_path: Path, images: Path) -> None:
+    clip = tmp_path / "walk.mp4"
+    clip.touch()
+    (tmp_path / "2024").mkdir()
+    shutil.copy(images / "view1.png", tmp_path / "2024" / "a.png")
+    assert whole_capture(clip) == clip and whole_capture(images) == images
+    assert whole_capture(images / "view3.png") == images
+    assert whole_capture(tmp_path / "2024/a.png") == tmp_path / "2024"
+    assert whole_capture(tmp_path / "nothing") == tmp_path / "nothing"
+
+
+def test_videos_next_to_few_photographs_are_the_capture(tmp_path: Path, frames: Frames) -> None:
+    write(apps.stray, tmp_path / "a", frames)
+    (tmp_path / "a/rgb.mp4").rename(tmp_path / "walk.mp4")
+    shutil.rmtree(tmp_path / "a")
+    cv2.imwrite(str(tmp_path / "poster.jpg"), frames[0][1])
+    capture = open_capture(tmp_path, IngestConfig())
+    assert capture.kind == "video" and "1 photograph (poster.jpg)" in capture.told
+    (tmp_path / "100GOPRO").mkdir()
+    (tmp_path / "walk.mp4").rename(tmp_path / "100GOPRO/GX01.MP4")
+    assert open_capture(tmp_path, IngestConfig()).kind == "video"
+
+
+@pytest.mark.parametrize(
+    "place", ["mask/{}.png", "shots/masks/{}.jpg.png", "shots/mask_{}.png", "shots/{}.mask.png"]
+)
+def test_masks_at_other_places(tmp_path: Path, frames: Frames, place: str) -> None:
+    for index, (_, image) in enumerate(frames):
+        apps.save(tmp_path / f"shots/{index:03d}.jpg", image)
+        apps.save(
+            tmp_path / place.format(f"{index:03d}"), np.full((240, 320, 3), 255 * (index > 0), np.uint8)
+        )
+    capture = open_capture(tmp_path, IngestConfig())
+    stencils = [read_stencil(frame) for frame in capture.frames]
+    assert len(stencils) == 10 and "and 10 masks" in capture.told
+    assert [None if s is None else bool(s.all()) for s in stencils] == [False] + [True] * 9
+
+
+def test_raw_photographs_are_told(images: Path) -> None:
+    for name in ("a.DNG", "b.CR3", "c.psd"):
+        (images / name).write_bytes(b"II*\0")
+    assert "3 raw or other pictures (a.DNG, b.CR3, c.psd)" in open_capture(images, IngestConfig()).told
+
+
+def test_poses_in_a_folder_below_are_not_passed_over_in_silence(posed: Path) -> None:
+    outer = posed.parent / "outer"
+    outer.mkdir()
+    posed.rename(outer / "room")
+    capture = open_capture(outer, IngestConfig())
+    assert len(capture.frames) == 10 and capture.kind == "images"
+    assert any(f"give {outer / 'room'} as the input" in note for note in capture.notes)
+    assert open_capture(outer, IngestConfig(poses="sfm")).notes == ()
+
+
+def test_a_backup_of_the_photographs_is_not_read_twice(images: Path, frames: Frames) -> None:
+    shutil.copytree(images, images.parent / "copy")
+    shutil.move(images.parent / "copy", images / "backup")
+    assert len(open_capture(images, IngestConfig()).frames) == 10
+    cv2.imwrite(str(images / "backup/view3.png"), frames[4][1])  # now they are pictures of a second camera
+    assert len(open_capture(images, IngestConfig()).frames) == 20
+
+
+def test_videos_by_choice(tmp_path: Path, frames: Frames) -> None:
+    write(apps.stray, tmp_path / "a", frames)
+    for name in ("walk1.mp4", "walk2.mp4"):
+        shutil.copy(tmp_path / "a/rgb.mp4", tmp_path / name)
+    shutil.rmtree(tmp_path / "a")
+    capture = open_capture(tmp_path, IngestConfig(only="walk2*"))
+    assert {frame.path.name for frame in capture.frames} == {"walk2.mp4"}
+    assert externals(tmp_path, IngestConfig(only="walk2*")) == {"capture": tmp_path / "walk2.mp4"}
