@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import Field
 from pydantic_core import to_jsonable_python
 
 import cleargs
@@ -72,6 +73,8 @@ class Manifest(FrozenModel):
     """"STAGE/PATH" (inputs) or role (externals) -> digest of each file in it."""
     files: dict[str, FileRecord]
     """Relative path -> size and digest of every file except the manifest."""
+    columns: dict[str, dict[str, str]] = Field(default_factory=dict)
+    """Relative path of a table -> column -> meaning. Most readers drop the meanings in the Parquet files."""
     digest: str
     """Digest of all files together (`tree_digest`)."""
     versions: dict[str, str]
