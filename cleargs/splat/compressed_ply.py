@@ -33,6 +33,8 @@ SH_MAX = 4.0
 CHUNK = 256
 """Number of Gaussians per chunk."""
 
+_ZERO = 1e-5  # rotated zeros are rounded
+
 LOG_SCALE_MAX = 20.0
 """Limit of log scales; outliers would make the range of the others too coarse."""
 
@@ -82,7 +84,7 @@ def compressed_ply(scene: Scene) -> bytes:
 def without_zero_degrees(gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians without the highest degrees of harmonics in which all coefficients are 0."""
     degree = gaussians.sh_degree
-    while degree and not bool(gaussians.sh[:, degree**2 :].any()):
+    while degree and not bool((gaussians.sh[:, degree**2 :].abs() > _ZERO).any()):
         degree -= 1
     return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2].contiguous())
 
@@ -104,7 +106,7 @@ def compressed_remarks(scene: Scene) -> list[str]:
 def _levels(sh: NDArray[np.float32]) -> NDArray[np.uint8]:  # [N, 3 (K - 1)] -> the same
     """Encode coefficients. 0 is between two levels; both are used in turn, so that the errors cancel."""
     levels: NDArray[np.uint8] = np.clip((sh / 8.0 + 0.5) * 256.0, 0, 255).astype(np.uint8)
-    row, column = np.nonzero(sh == 0.0)
+    row, column = np.nonzero(np.abs(sh) <= _ZERO)
     levels[row, column] = 127 + (row + column) % 2
     return levels
 

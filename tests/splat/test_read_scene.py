@@ -12,6 +12,7 @@ import numpy as np
 import plyfile
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from test_compressed_ply import make
 
 from cleargs.errors import CleargsError, InputError, StoreError
@@ -109,6 +110,15 @@ def test_zero_harmonics_stay_zero(kind: str, tmp_path: Path) -> None:
     assert found.sh_degree == degree
     assert not found.sh[:, 4:].abs().gt(1e-6).any()
     assert (found.sh[:, 1:4] - made.sh[:, 1:4]).abs().mean() < 0.02
+
+
+def test_zeros_that_were_rotated_are_zeros(tmp_path: Path) -> None:
+    """``--sh-degree 3 --up y`` pads before it turns, and the rounding of the turn is not 0."""
+    turn = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
+    turned = transform_scene(padded(scene(1), 3), scale=1.0, rotation=turn, translation=np.zeros(3))
+    assert turned.gaussians.sh[:, 4:].any()
+    _, found = trip(turned, "compressed.ply", tmp_path)
+    assert found.sh_degree == 1
 
 
 def test_zeros_between_other_harmonics_do_not_add_up(tmp_path: Path) -> None:
