@@ -24,8 +24,8 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
 READ = (
-    "a .ply (text or binary, any number type), .compressed.ply, .sog (version 2), .spz, .glb "
-    "(KHR_gaussian_splatting) or .usdc of Gaussians with harmonics of degree 0 to 3 is read"
+    "give Gaussians of degree 0 to 3 as .ply (text or binary), .compressed.ply, .sog (version 2), "
+    ".spz (1 to 4), .glb (KHR_gaussian_splatting) or .usdc"
 )
 """The scene files that are read, for hints."""
 

@@ -112,6 +112,8 @@ def test_a_file_of_another_program_is_exported(
     for wrong in (["--metres", "0-1=2"], ["--world", "input"], ["--prune", "opacity:0.1"], ["--cameras"]):
         assert invoke(["export", str(tmp_path / "x.sog"), "-o", str(tmp_path / "z.ply"), *wrong]) == 2
         assert "need the cameras of a run" in capsys.readouterr().err
+    assert invoke(["export", str(tmp_path / "x.sog"), "-o", str(tmp_path / "z.ply"), "--stage", "g0"]) == 2
+    assert "leave it out for a file" in capsys.readouterr().err
     before = (tmp_path / "x.sog").read_bytes()
     assert invoke(["export", str(tmp_path / "x.sog"), "-o", str(tmp_path / "x.sog"), "--force"]) == 2
     assert (tmp_path / "x.sog").read_bytes() == before

@@ -16,6 +16,7 @@ from test_compressed_ply import make
 
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera, cameras_json
+from cleargs.splat.constants import SH_C0
 from cleargs.splat.formats import FORMATS, format_of, padded, write_scene
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
@@ -139,6 +140,21 @@ def test_glb_follows_the_specification(sh_degree: int, tmp_path: Path) -> None:
     if sh_degree:
         assert_turned(found, made.gaussians, ABOUT_Z, sh_within=1e-5)
     assert attribute("COLOR_0").shape == (made.gaussians.num, 4)
+
+
+def test_glb_colours_are_linear(tmp_path: Path) -> None:
+    """The specification decodes sRGB for COLOR_0; viewers without the extension showed it too bright."""
+    made = scene(0, count=3)
+    made.gaussians.sh[:, 0] = (torch.tensor([[0.0], [0.5], [1.5]]) - 0.5) / SH_C0
+    made.gaussians.logit_opacities[:] = 0.0
+    write_scene(tmp_path / "a.glb", made, "glb")
+    content = (tmp_path / "a.glb").read_bytes()
+    (length,) = struct.unpack("<I", content[12:16])
+    document = json.loads(content[20 : 20 + length])
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    start = 28 + length + document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    colours = np.frombuffer(content[start : start + 12], np.uint8).reshape(3, 4)
+    assert colours.tolist() == [[0, 0, 0, 128], [55, 55, 55, 128], [255, 255, 255, 128]]
 
 
 def test_usd_read_by_openusd(tmp_path: Path) -> None:

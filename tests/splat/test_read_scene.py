@@ -308,7 +308,7 @@ def test_a_damaged_file_of_another_program_names_what_is_read(kind: str, tmp_pat
         path.write_bytes(damage(whole))
         with pytest.raises(StoreError, match=r"cannot read the scene") as caught:
             read_scene(path)
-        assert "is read" in caught.value.hint and "stage" not in caught.value.hint
+        assert "give Gaussians" in caught.value.hint and "stage" not in caught.value.hint
 
 
 def test_a_damaged_file_of_a_stage_names_the_stage(tmp_path: Path) -> None:
