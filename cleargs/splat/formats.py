@@ -35,14 +35,8 @@ _ABOUT_Z = (-1.0, -1.0, 1.0)  # to x left, y up, z forward: glTF, and PLYs in th
 _FAULTS = (*FAULTS, RuntimeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, cv2.error)
 
 
-def _nothing(scene: Scene) -> list[str]:
-    return []
-
-
 def _no_antialiasing(scene: Scene) -> list[str]:
-    lost = (
-        "the format cannot say that the scene is anti-aliased (viewers make small things too bold); .sog can"
-    )
+    lost = "it cannot say that the scene is anti-aliased, so small things look too bold; .sog can"
     return [lost] if scene.antialias else []
 
 
@@ -58,7 +52,7 @@ class Format:
     """True: y is always up in the format."""
     read: Callable[[Path], Scene] | None = None
     """Function that reads a scene with the axes of the format."""
-    remarks: Callable[[Scene], list[str]] = _nothing
+    remarks: Callable[[Scene], list[str]] = lambda scene: []
     """Function that names what the format loses of a scene."""
 
 
