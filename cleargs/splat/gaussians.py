@@ -104,14 +104,16 @@ class Gaussians:
         return Gaussians(**{name: tensor[index].contiguous() for name, tensor in self.tensors().items()})
 
     def bounded(self) -> Gaussians:
-        """Return the Gaussians with `OPAQUE` for infinite opacities, and with `FLAT` for zero sizes.
+        """Return the Gaussians without infinite opacities (`OPAQUE`), zero sizes (`FLAT`) and zero rotations.
 
-        Formats with activated values have both. Raises ValueError if another value is not finite.
+        Files of other programs have all three. Raises ValueError if another value is not finite.
         """
-        nan = float("nan")
+        nan, identity = float("nan"), self.rotations.new_tensor([1.0, 0.0, 0.0, 0.0])
+        unset = (self.rotations == 0.0).all(dim=1, keepdim=True)
         tensors = self.tensors() | {
             "logit_opacities": torch.nan_to_num(self.logit_opacities, nan, OPAQUE, -OPAQUE),
             "log_scales": torch.nan_to_num(self.log_scales, nan, math.inf, FLAT),
+            "rotations": torch.where(unset, identity, self.rotations),
         }
         found = Gaussians(**tensors)
         if fault := found.fault():

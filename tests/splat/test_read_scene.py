@@ -141,11 +141,13 @@ def test_extreme_opacities_and_needles(kind: str, tmp_path: Path) -> None:
     made = scene(1)
     made.gaussians.sh[:, 0].clamp_(-0.5, 0.5)
     made.gaussians.logit_opacities[:4] = torch.tensor([np.inf, -np.inf, 60.0, -60.0])
+    made.gaussians.rotations[8] = 0.0
     made.gaussians.log_scales[4:8] = torch.tensor([-1.0, -9.5, -9.5])
     if kind == "compressed.ply":  # its steps follow the range of 256 Gaussians
         made.gaussians.log_scales.clamp_(-9.5, 0.0)
     written, found = trip(made, kind, tmp_path)
     assert found.fault() is None
+    assert (found.rotations.norm(dim=1) - 1.0).abs().max() < 1e-3
     assert (found.logit_opacities.sigmoid() - written.logit_opacities.sigmoid()).abs().max() < 1.5 / 255
     needles = written.log_scales[:, 1] == -9.5
     assert int(needles.sum()) >= 4
