@@ -99,7 +99,10 @@ oracles: .oracles/stamp
 
 .oracles/stamp: Makefile
 	npm install --prefix .oracles --ignore-scripts --silent \
-		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
+		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 @adobe/spz@0.2.3
+	# Most of the files are maps, debug builds and the GPU drivers of other machines.
+	cd .oracles/node_modules && rm -rf playcanvas/build/playcanvas?* && find . -name '*.map' -delete && find webgpu/dist \
+		-name '*.node' ! -name "$$(node -p 'process.platform')-$$(node -p 'process.arch').*" -delete
 	touch $@
 
 # A separate environment, because Snakemake needs other versions of numpy and pandas.

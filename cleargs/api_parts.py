@@ -166,7 +166,7 @@ def save(scene: Scene, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> Scene:
-    """Read a PLY file with Gaussians, as ClearGS and the Inria code write it.
+    """Read a scene file of any program: .ply, .compressed.ply, .sog, .spz, .glb, .usdc.
 
     Raises:
         StoreError: if the file cannot be read.
@@ -175,9 +175,9 @@ def load(path: str | Path) -> Scene:
         scene = cg.load("run/g0/scene.ply")
         print(scene.gaussians.num)
     """
-    from cleargs.splat.ply import read_ply
+    from cleargs.splat.formats import read_scene
 
-    return read_ply(Path(path))
+    return read_scene(Path(path))
 
 
 def score_frames(

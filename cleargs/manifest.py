@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import Field
 from pydantic_core import to_jsonable_python
 
 import cleargs
@@ -77,6 +78,8 @@ class Manifest(FrozenModel):
     """"STAGE/PATH" (inputs) or role (externals) -> digest of each file in it."""
     files: dict[str, FileRecord]
     """Relative path -> size and digest of every file except the manifest."""
+    columns: dict[str, dict[str, str]] = Field(default_factory=dict)
+    """Relative path of a table -> column -> meaning. Most readers drop the meanings in the Parquet files."""
     digest: str
     """Digest of all files together (`tree_digest`)."""
     versions: dict[str, str]

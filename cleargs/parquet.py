@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import NoneType, UnionType
@@ -60,6 +60,17 @@ def read_table(path: Path, schema: pa.Schema) -> pa.Table:
             if field.nullable and field.name not in table.column_names:
                 table = table.append_column(field, pa.nulls(table.num_rows, field.type))
         return table.select(schema.names).cast(schema)
+
+
+def meanings(schema: pa.Schema) -> dict[str, str]:
+    """Return column -> meaning, as stored in the file."""
+    return {field.name: (field.metadata or {}).get(b"meaning", b"").decode() for field in schema}
+
+
+def table_meanings(folder: Path, names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return name -> `meanings` of the tables among the files ``names`` in ``folder``."""
+    tables = sorted(name for name in names if name.endswith(".parquet"))
+    return {name: meanings(pq.read_schema(folder / name)) for name in tables}
 
 
 def read_any_table(path: Path) -> pa.Table:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
+    if run.is_file():
+        raise InputError("--stage chooses among the scenes of a run", hint="leave it out for a file")
     done = [name for name in dag.names if scene_path(run, name).is_file() and has_results(run, name)]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:

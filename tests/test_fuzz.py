@@ -41,6 +41,7 @@ from cleargs.pipeline.config import read_toml
 from cleargs.progress import SilentReporter
 from cleargs.render.shots import read_poses
 from cleargs.splat.camera import Camera
+from cleargs.splat.formats import FORMATS, read_scene, write_scene
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.scene import Scene
@@ -222,6 +223,12 @@ def ply(folder: Path) -> None:
     write_ply(folder / "a.ply", scene())
 
 
+def scenes(folder: Path) -> None:
+    folder.mkdir()
+    for kind in sorted(set(FORMATS) - {"usdc"}):
+        write_scene(folder / f"a.{kind}", scene(), kind)
+
+
 def all_of(read: Callable[[Path], object], pattern: str) -> Callable[[Path], object]:
     def each(folder: Path) -> object:
         for file in sorted(folder.glob(pattern)):
@@ -237,6 +244,7 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path], object]]] = {
     "COLMAP text": (text_model, read_model),
     "transforms.json": (transforms, read_capture),
     "LLFF": (npy, lambda folder: read_poses_bounds(folder / "poses_bounds.npy")),
+    "scenes": (scenes, all_of(read_scene, "a.*")),
     "PLY": (ply, lambda folder: read_ply(folder / "a.ply")),
     "EXR": (exr, lambda folder: read_exr(folder / "a.exr", "cleargs:")),
     "images": (pictures, all_of(read_rgb, "a.*")),

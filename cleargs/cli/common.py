@@ -85,6 +85,7 @@ partial_option = click.option(
     "--allow-partial", is_flag=True, help="Continue after a stage that is done only in part."
 )
 run_argument = click.argument("run", type=FOLDER)
+scene_argument = click.argument("run", metavar="RUN|SCENE", type=click.Path(exists=True, path_type=Path))
 
 
 verbose_option = click.option(

@@ -57,7 +57,7 @@ Examples:
   cleargs eval room --reference capture/truth/observed     the last scene, at the frames' poses
   cleargs eval room --reference capture/truth/novel --stage all
   cleargs eval room                                        on the frames held out (ingest.holdout)
-  cleargs eval scene.ply --reference DIR --json            a scene in the world of DIR
+  cleargs eval scene.ply --reference DIR --json            a scene file of any program, in the world of DIR
   cleargs eval --renders DIFIX --reference DIR -o difix.json
 
 \b
@@ -66,7 +66,7 @@ RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet 
 stages and options stay there as long as their scenes do.
 """
 )
-@click.argument("target", required=False, metavar="[RUN|SCENE.ply]", type=click.Path(path_type=Path))
+@click.argument("target", required=False, metavar="[RUN|SCENE]", type=click.Path(path_type=Path))
 @click.option(
     "--reference",
     "directory",
@@ -234,12 +234,12 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
     """Return name -> file of each scene to render; empty if finished images are evaluated."""
     if renders is not None:
         if stages or (target is not None and not target.is_dir()):
-            raise InputError("--renders takes the place of a scene", hint="leave out --stage and SCENE.ply")
+            raise InputError("--renders takes the place of a scene", hint="leave out --stage and SCENE")
         return {}
     if target is None:
-        raise InputError("there is nothing to evaluate", hint="give a RUN, a SCENE.ply, or --renders DIR")
+        raise InputError("there is nothing to evaluate", hint="give a RUN, a SCENE, or --renders DIR")
     if not target.exists():
-        raise InputError(f"{target} does not exist", hint="give the folder of a run, or a scene.ply")
+        raise InputError(f"{target} does not exist", hint="give the folder of a run, or a scene file")
     if not target.is_dir():
         if stages:
             raise InputError("--stage chooses among the scenes of a run", hint="leave it out for a file")

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import FILE, answer, json_option, quiet_option, run_argument, scene_option
+from cleargs.cli.common import FILE, answer, json_option, quiet_option, scene_argument, scene_option
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
@@ -24,13 +24,16 @@ Examples:
   cleargs export room -o room.ply --metres 0-40=3.5   frames 0 and 40 were filmed 3.5 m apart
   cleargs export room -o room.ply --world input    in the world of the capture's poses
   cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
+  cleargs export other.spz -o other.ply            a scene file of any program
 
 \b
 Formats:
   .ply              all values; read by most programs
   .compressed.ply   a quarter of the size: SuperSplat, Spark, Brush
   .sog              a fifth of the size: SuperSplat, PlayCanvas, Spark
-  .spz              a seventh of the size: Spark, Scaniverse
+  .spz              a sixth of the size: Spark, Babylon, Blender, Scaniverse; not for worlds that are very
+                    small or large. Spark and Scaniverse expect y up in it, as written by default. The
+                    programs that read it like a .ply (SuperSplat, Babylon, Open3D) need --up=-y
   .glb .usdc        glTF and OpenUSD
 
 \b
@@ -38,7 +41,7 @@ Programs of --for:
 """
     + "\n".join(f"  {name:<12} .{target.ending}, {target.hint}" for name, target in TARGETS.items())
 )
-@run_argument
+@scene_argument
 @click.option(
     "--sh-degree",
     type=click.IntRange(0, 3),
@@ -54,8 +57,9 @@ Programs of --for:
 @click.option(
     "--up",
     type=click.Choice(["-y", "y", "z"]),
-    help="Turn the scene so that this axis points up. The camera of the first frame is then at the origin "
-    "and looks ahead. Use y for Spark and three.js, z for Blender.  [default: the axes of SuperSplat]",
+    help="Turn the scene so that this axis points up (write --up=-y with =). The camera of the "
+    "first frame is then at the origin and looks ahead. "
+    "Use y for Spark and three.js, z for Blender.  [default: the axes of SuperSplat]",
 )
 @click.option(
     "--prune",
@@ -69,6 +73,11 @@ Programs of --for:
     metavar="box:X,Y,Z,X,Y,Z|percentile:P",
     help="Keep the Gaussians in a box. Give two corners in the coordinates of cameras.json, or P for the "
     "middle P percent along each axis.",
+)
+@click.option(
+    "--spz",
+    type=click.Choice([3, 4]),
+    help="Version of an .spz: 4 for PlayCanvas, 3 for all others.  [default: 3]",
 )
 @scene_option
 @click.option(
@@ -108,18 +117,23 @@ def export(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Write the scene of RUN to one or several files."""
-    from cleargs.render.export import ExportOptions, export_scene
+    """Write the scene of RUN, or a scene file of any program, to one or several files."""
+    from cleargs.render.export import ExportOptions, export_file, export_scene
 
     target = TARGETS[program] if program is not None else None
     if target is not None:
-        outputs = outputs or (Path(f"{run.resolve().name}-{program}.{target.ending}"),)
-        for name in ("up", "sh_degree"):
+        name = run.resolve().name if run.is_dir() else run.name.split(".")[0]
+        outputs = outputs or (Path(f"{name}-{program}.{target.ending}"),)
+        for name in ("up", "sh_degree", "spz"):
             options[name] = getattr(target, name) if options[name] is None else options[name]
     if not outputs:
         raise InputError("no file is given", hint="give -o FILE, or --for PROGRAM")
-    stage = scene_stage(dag, run, chosen)
-    lines = export_scene(run, stage, outputs, ExportOptions(**options), make_reporter(quiet))
+    given = ExportOptions(**{**options, "spz": options["spz"] or 3})
+    stage = None if run.is_file() and chosen is None else scene_stage(dag, run, chosen)
+    if stage is None:
+        lines = export_file(run, outputs, given)
+    else:
+        lines = export_scene(run, stage, outputs, given, make_reporter(quiet))
     if target is not None:
         lines.append(f"{program}: {target.hint}")
     answer(as_json, {"files": list(map(str, outputs)), "stage": stage, "messages": lines}, *lines)

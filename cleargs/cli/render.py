@@ -13,7 +13,7 @@ from cleargs.cli.common import (
     json_option,
     parse_size,
     quiet_option,
-    run_argument,
+    scene_argument,
     scene_option,
     work_options,
 )
@@ -33,6 +33,7 @@ Examples:
   cleargs render room -o still.png --frame 12           at the pose of frame 12
   cleargs render room -o still.exr --frame 12           scene-linear RGB, alpha and depth
   cleargs render room -o shots/%04d.exr --poses shots.json
+  cleargs render other.spz -o %04d.png --poses shots.json   a scene file of any program
 
 \b
 FILE.mp4 is a film. FILE.png and FILE.exr are stills. FOLDER/%04d.png and .exr are numbered stills with a
@@ -41,7 +42,7 @@ units of the run. --poses reads cameras.json of `cleargs export` and transforms.
 renders a picture for each pose.
 """
 )
-@run_argument
+@scene_argument
 @click.option(
     "--frame", type=click.IntRange(min=0), metavar="N", help="Render a still at the pose of this frame."
 )
@@ -105,17 +106,17 @@ def render(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Render the scene of RUN: a film along the camera path, a turntable, or stills.
+    """Render the scene of RUN or a scene file: a film along the camera path, a turntable, or stills.
 
-    Without --frame, --turntable and --poses, a film and numbered stills follow the camera path. A single
-    still is taken in the middle of it.
+    A scene file has no cameras: it needs --poses, in its own world. Without --frame, --turntable and
+    --poses, a film and numbered stills follow the camera path. A single still is taken in the middle of it.
     """
     from cleargs.render.shots import ShotOptions, render_run
     from cleargs.splat.backend import set_threads
 
     given = ShotOptions(**options)
     given.check(output)
-    stage = scene_stage(dag, run, chosen)
+    stage = run.name if run.is_file() and chosen is None else scene_stage(dag, run, chosen)
     reporter = make_reporter(quiet)
     on = resolve_device(device, reporter.info)
     set_threads(threads)

@@ -27,7 +27,7 @@ from cleargs.cli.frame_rows import frame_rows, reason, short_name
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.packed import WORKS, read_pack
-from cleargs.parquet import read_any_table, read_table
+from cleargs.parquet import meanings, read_any_table, read_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
 from cleargs.pipeline.outputs import check_outputs
@@ -158,10 +158,7 @@ def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bo
     if stage == "rva":
         repairs = read_any_table(run / "rivr" / "selection.parquet").to_pylist() if "rivr" in done else None
         frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
-    described = {
-        name: [(field.name, (field.metadata or {}).get(b"meaning", b"").decode()) for field in table.schema]
-        for name, table in tables.items()
-    }
+    described = {name: list(meanings(table.schema).items()) for name, table in tables.items()}
     if as_json:
         facts = {
             name: {"rows": tables[name].num_rows, "columns": dict(fields)}

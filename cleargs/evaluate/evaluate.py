@@ -33,7 +33,8 @@ from cleargs.plugins import installed_version
 from cleargs.progress import Reporter
 from cleargs.splat.backend import decibels, rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
-from cleargs.splat.ply import read_ply
+from cleargs.splat.formats import read_scene
+from cleargs.splat.ply import READ
 from cleargs.splat.scene import Scene
 from cleargs.types import ArrayF64, ImageU8, MaskBool, PlaneF32
 
@@ -72,17 +73,16 @@ def evaluate_scene(
     subject: str | None = None,
     save: Path | None = None,
 ) -> Evaluation:
-    """Render the PLY file ``scene`` at every view of ``reference``, without exposure affines, and measure.
+    """Render the file ``scene`` at every view of ``reference``, without exposure affines, and measure.
 
     ``subject`` is its name in the result (None: that of the file). ``save`` is a folder for the evaluated
     images. Results do not depend on ``threads``. Raises InputError if the file is not a scene.
     """
     try:
-        loaded = read_ply(scene)
+        loaded = read_scene(scene)
     except StoreError as error:
         raise InputError(
-            f"{scene} is not a scene of Gaussians: {str(error).split(': ', 1)[-1]}",
-            hint="give a scene.ply as `cleargs export` or the Inria code writes it",
+            f"{scene} is not a scene of Gaussians: {str(error).split(': ', 1)[-1]}", hint=READ
         ) from error
     set_threads(threads)
     renderer = _renderer(loaded, options.refine_poses, reference.points)

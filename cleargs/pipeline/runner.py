@@ -248,6 +248,8 @@ class Runner(Planner):
                 f"{name} ended without its outputs {', '.join(absent)}",
                 hint=f"this is a bug in the stage; please report it with {self.run.folder / RUN_FILE}",
             )
+        from cleargs.parquet import table_meanings  # loads pyarrow
+
         files = {
             name: FileRecord(size=file.stat().st_size, digest=file_digest(file))
             for name, file in published_files(work.out).items()
@@ -261,6 +263,7 @@ class Runner(Planner):
             parts=stage_key.parts,
             origins=stage_key.origins,
             files=files,
+            columns=table_meanings(work.out, files),
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
             started=started.isoformat(timespec="seconds"),

@@ -25,9 +25,11 @@ from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
 from cleargs.run_results import scene_path
 from cleargs.splat.camera import Camera, cameras_json
-from cleargs.splat.formats import check_up, format_of, padded, write_scene
+from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
 from cleargs.splat.ply import read_ply
-from cleargs.splat.transforms import far_offset, orient_up, transform_scene
+from cleargs.splat.scene import Scene
+from cleargs.splat.spz import SpzVersion
+from cleargs.splat.transforms import UP, far_offset, orient_up, transform_scene
 
 MODEL = "colmap/sparse/0"
 
@@ -47,6 +49,8 @@ class ExportOptions:
     """Write cameras and COLMAP model too."""
     force: bool = False
     """Replace existing files."""
+    spz: SpzVersion = 3
+    """Version of .spz files."""
 
 
 def export_scene(
@@ -56,12 +60,10 @@ def export_scene(
 
     Raises InputError if an option cannot be used, or if a file exists and is not to be replaced.
     """
-    kinds = [format_of(output) for output in outputs]
-    for kind in kinds:
-        check_up(kind, options.up)
+    kinds = _kinds(outputs, options)
     if options.up is not None and options.world == "input":
         raise InputError("--up and --world input exclude each other", hint="give one of them")
-    thresholds, region = parse_prune(options.prune), parse_crop(options.crop)
+    thresholds = parse_prune(options.prune)
     check_outputs(outputs, installed(), run, force=options.force)
     ingest = run / "ingest"
     posed = [frame for frame in load_frames(ingest) if frame.registered]
@@ -84,24 +86,70 @@ def export_scene(
         )
     if similarity:
         scene = transform_scene(scene, **similarity)
-    if region is not None:
+    scene, cropped = _cropped(scene, options)
+    for output in outputs if options.cameras else ():
+        _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
+    axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
+    written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {stage}, {axes}")
+    return [*messages, *cropped, *written]
+
+
+def export_file(file: Path, outputs: Sequence[Path], options: ExportOptions) -> list[str]:
+    """Write the scene file of any program to each of the ``outputs``. Return messages about the result.
+
+    Raises InputError for options that need a run, and StoreError if the file cannot be read.
+    """
+    kinds = _kinds(outputs, options)
+    if options.world == "input" or options.metres or options.prune or options.cameras:
+        raise InputError(
+            "--world, --metres, --prune and --cameras need the cameras of a run",
+            hint="leave them out for a file",
+        )
+    check_outputs(outputs, installed(), inputs=[file], force=options.force)
+    scene = read_scene(file)
+    if options.sh_degree is not None:
+        scene = padded(scene, options.sh_degree)
+    if options.up is not None:
+        scene = transform_scene(scene, scale=1.0, rotation=np.array(UP[options.up]), translation=np.zeros(3))
+    scene, cropped = _cropped(scene, options)
+    written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {file.name}")
+    return [*cropped, *written]
+
+
+def _kinds(outputs: Sequence[Path], options: ExportOptions) -> list[str]:
+    """Return the formats of the ``outputs``. Raises InputError if one cannot be written so."""
+    kinds = [format_of(output) for output in outputs]
+    for kind in kinds:
+        check_up(kind, options.up)
+    parse_crop(options.crop)
+    return kinds
+
+
+def _cropped(scene: Scene, options: ExportOptions) -> tuple[Scene, list[str]]:
+    """Return the scene in the box of the options, and messages. Raises InputError if nothing is left."""
+    messages = []
+    if (region := parse_crop(options.crop)) is not None:
         scene, message = crop_scene(scene, region)
         messages.append(message)
-    if "ply" in kinds and 0 < (degree := scene.gaussians.sh_degree) < 3:
+    if scene.gaussians.num == 0:
+        raise InputError("no Gaussian is left", hint="prune or crop less")
+    return scene, messages
+
+
+def _write(scene: Scene, outputs: Mapping[Path, str], options: ExportOptions, subject: str) -> list[str]:
+    """Write a scene to each of the ``outputs`` (file -> format). Return messages."""
+    messages = []
+    if "ply" in outputs.values() and 0 < (degree := scene.gaussians.sh_degree) < 3:
         messages.append(
             f"spherical harmonics of degree {degree}: for viewers of degree 3 only, --sh-degree 3"
         )
-    if scene.gaussians.num == 0:
-        raise InputError("no Gaussian is left", hint="prune or crop less")
-    for output, kind in zip(outputs, kinds, strict=True):
+    for output, kind in outputs.items():
         with disk_errors(output):
             output.parent.mkdir(parents=True, exist_ok=True)
-        if options.cameras:
-            _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
-        write_scene(output, scene, kind, turned=options.up is not None)
-    axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
-    count = scene.gaussians.num
-    return [*messages, *(f"{output}: scene of {stage}, {count} Gaussians, {axes}" for output in outputs)]
+        turned = options.up is not None
+        messages += write_scene(output, scene, kind, turned=turned, spz_version=options.spz)
+        messages.append(f"{output}: {subject}, {scene.gaussians.num} Gaussians")
+    return messages
 
 
 def _stem(output: Path) -> str:

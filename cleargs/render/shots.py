@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +26,7 @@ from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.run_results import scene_path
 from cleargs.safe_io import FAULTS, cause, read_json
 from cleargs.splat.camera import Camera
-from cleargs.splat.ply import read_ply
+from cleargs.splat.formats import read_scene
 
 World = Literal["normalised", "input"]
 
@@ -38,6 +38,9 @@ _NERFSTUDIO = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "c
 """Field of transforms.json -> field of a camera."""
 
 Size = tuple[int, int]
+
+_LENS = Camera(1280, 720, 960.0, 960.0, 640.0, 360.0, np.eye(4))
+"""Lens of the poses of a scene file, if they name none: 67 degrees wide."""
 
 SECONDS = 10.0
 """Default length of a film."""
@@ -96,19 +99,28 @@ def render_run(
 ) -> list[Shot]:
     """Render the scene of a stage of ``run`` to ``output``. Return the shots.
 
-    Raises InputError if an option cannot be used, or if ``output`` exists and is not to be replaced.
+    A scene file without a run is rendered at the poses of the options, which are in its own world. Raises
+    InputError if an option cannot be used, or if ``output`` exists and is not to be replaced.
     """
     options.check(output)
     kind = kind_of(output)
     if kind == "folder" and output.parent.exists():  # it may contain other files than stills
         raise InputError(f"{output.parent} exists already", hint="choose a new folder")
     inputs = () if options.poses is None else (options.poses,)
-    check_outputs([output], installed(), run, inputs=inputs, force=force)
-    if options.side_by_side:
-        require_images(run, "--side-by-side")
-    shots = _shots(run / "ingest", options, kind)
+    if run.is_file():
+        check_outputs([output], installed(), inputs=(run, *inputs), force=force)
+        if options.poses is None:
+            raise InputError(f"{run} has no cameras", hint="give --poses FILE.json, or a run")
+        own = Similarity(np.eye(3), np.zeros(3), 1.0)
+        shots = _framed(read_poses(options.poses, _LENS, own, "normalised"), options, kind)
+        file = run
+    else:
+        check_outputs([output], installed(), run, inputs=inputs, force=force)
+        if options.side_by_side:
+            require_images(run, "--side-by-side")
+        shots, file = _shots(run / "ingest", options, kind), scene_path(run, stage)
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
-        scene = read_ply(scene_path(run, stage))
+        scene = read_scene(file)
         write_shots(output, scene, shots, task, fps=options.fps, codec=options.codec, device=device)
     return shots
 
@@ -148,13 +160,21 @@ def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
         poses, nearest = smooth_path(own, count)
         cameras = [replace(lens, world_to_camera=pose) for pose in poses]
         filmed = [frames[index] for index in nearest]
+    images = [ingest / frame.image for frame in filmed] if options.side_by_side else None
+    return _framed(cameras, options, kind, images)
+
+
+def _framed(
+    cameras: Sequence[Camera], options: ShotOptions, kind: Kind, images: Sequence[Path | None] | None = None
+) -> list[Shot]:
+    """Return shots of one size, with the ``images`` next to them."""
     width, height = options.size or (cameras[0].width, cameras[0].height)
     if options.size is None and kind == "film":
         width, height = width + width % 2, height + height % 2
     if width * height > MAX_PIXELS:
         raise InputError(f"an image of {width}x{height} pixels is too large", hint="give a smaller --size")
-    images = [ingest / frame.image for frame in filmed] if options.side_by_side else [None] * len(cameras)
-    return [Shot(framed(camera, width, height), image) for camera, image in zip(cameras, images, strict=True)]
+    beside: Sequence[Path | None] = images or [None] * len(cameras)
+    return [Shot(framed(camera, width, height), image) for camera, image in zip(cameras, beside, strict=True)]
 
 
 def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | None = None) -> list[Camera]:

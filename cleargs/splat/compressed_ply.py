@@ -8,12 +8,15 @@ float32. A Gaussian stores:
 - the three smaller components of its quaternion (10 bits each) and the index of the largest (2 bits);
 - its opacity (8 bits).
 
-Coefficients of the spherical harmonics above degree 0 have 8 bits for the range from -4 to 4. Source: the
+Coefficients of the spherical harmonics above degree 0 have 8 bits for the range from -4 to 4: n stands for
+(n + 0.5) / 32 - 4, so no level is 0. Degrees of zeros only are therefore left out. Source: the reader and the
 writer of splat-transform.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,12 +27,19 @@ from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
+SH_MAX = 4.0
+"""Largest magnitude of a coefficient of the harmonics above degree 0."""
+
 CHUNK = 256
 """Number of Gaussians per chunk."""
+
+_ZERO = 1e-5  # rotated zeros are rounded
 
 LOG_SCALE_MAX = 20.0
 """Limit of log scales; outliers would make the range of the others too coarse."""
 
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # largest component -> the other three
+_SIZE_BITS, _COLOUR_BITS = (11, 10, 11), (8, 8, 8, 8)
 _MORTON_BITS = 21  # per coordinate; three fit into 63 bits
 _RANGES = [
     f"{end}_{name}"
@@ -42,7 +52,7 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 def compressed_ply(scene: Scene) -> bytes:
     """Encode a scene, with its Gaussians in Morton order; equal scenes give equal bytes."""
-    gaussians = scene.gaussians.to("cpu").detach()
+    gaussians = without_zero_degrees(scene.gaussians.to("cpu").detach())
     gaussians = gaussians.select(torch.from_numpy(morton_order(gaussians.means.numpy())))
     count, coefficients = gaussians.num, gaussians.sh.shape[1]
     ranges, packed = _chunks(gaussians)
@@ -52,6 +62,7 @@ def compressed_ply(scene: Scene) -> bytes:
         "ply",
         "format binary_little_endian 1.0",
         "comment written by ClearGS",
+        f"comment SplatRenderMode: {'mip' if scene.antialias else 'default'}",
         f"element chunk {len(ranges)}",
         *(f"property float {name}" for name in _RANGES),
         f"element vertex {count}",
@@ -65,8 +76,72 @@ def compressed_ply(scene: Scene) -> bytes:
             "\n".join(header).encode("ascii"),
             ranges.astype("<f4").tobytes(),
             packed.astype("<u4").tobytes(),
-            np.clip((by_colour / 8.0 + 0.5) * 256.0, 0, 255).astype(np.uint8).tobytes(),
+            _levels(by_colour).tobytes(),
         ]
+    )
+
+
+def without_zero_degrees(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians without the highest degrees of harmonics in which all coefficients are 0."""
+    degree = gaussians.sh_degree
+    while degree and not bool((gaussians.sh[:, degree**2 :].abs() > _ZERO).any()):
+        degree -= 1
+    return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2].contiguous())
+
+
+def compressed_remarks(scene: Scene) -> list[str]:
+    """Return what the format changes in this scene."""
+    found, sh = [], scene.gaussians.sh
+    if (left := without_zero_degrees(scene.gaussians).sh_degree) < scene.gaussians.sh_degree:
+        found.append(f"written with harmonics of degree {left}, because the format has no zeros")
+    if left > 1:
+        found.append("harmonics are rounded to 1/32, which cost 0.4 dB in a trained scene; .sog cost 0.01 dB")
+    if beyond := int((sh[:, 1:].abs() > SH_MAX + 1 / 64).any(dim=2).any(dim=1).sum()):
+        found.append(
+            f"harmonics beyond {SH_MAX:g} in {beyond} of {len(sh)} Gaussians: clipped; .sog holds them"
+        )
+    return found
+
+
+def _levels(sh: NDArray[np.float32]) -> NDArray[np.uint8]:  # [N, 3 (K - 1)] -> the same
+    """Encode coefficients. 0 is between two levels; both are used in turn, so that the errors cancel."""
+    levels: NDArray[np.uint8] = np.clip((sh / 8.0 + 0.5) * 256.0, 0, 255).astype(np.uint8)
+    row, column = np.nonzero(np.abs(sh) <= _ZERO)
+    levels[row, column] = 127 + (row + column) % 2
+    return levels
+
+
+def unpacked(elements: Mapping[str, NDArray[np.void]]) -> Gaussians:
+    """Decode the Gaussians of the elements ``chunk``, ``vertex`` and ``sh`` of a ``.compressed.ply``.
+
+    Raises a LookupError or ValueError if they do not fit together.
+    """
+    chunk, vertex = elements["chunk"], elements["vertex"]
+    which = np.arange(len(vertex)) // CHUNK
+
+    def ranged(values: NDArray[np.float64], *names: str) -> torch.Tensor:
+        low, high = (
+            np.stack([chunk[f"{end}_{name}"] for name in names], axis=1)[which] for end in ("min", "max")
+        )
+        return torch.from_numpy((low + values * (high.astype(np.float64) - low)).astype(np.float32))
+
+    colour = _unpack(vertex["packed_color"], _COLOUR_BITS)
+    rotation = (_unpack(vertex["packed_rotation"] & 0x3FFFFFFF, (10, 10, 10)) - 0.5) * np.sqrt(2.0)
+    colours = torch.from_numpy(colour[:, :3].astype(np.float32))
+    if "min_r" in (chunk.dtype.names or ()):  # files of 2024 have colours from 0 to 1
+        colours = ranged(colour[:, :3], "r", "g", "b")
+    sh = ((colours - 0.5) / SH_C0)[:, None]
+    if "sh" in elements:
+        names = elements["sh"].dtype.names or ()
+        levels = np.stack([elements["sh"][f"f_rest_{index}"] for index in range(len(names))], axis=1)
+        rest = (levels.reshape(len(vertex), 3, -1).transpose(0, 2, 1) + 0.5) / 32.0 - SH_MAX
+        sh = torch.cat([sh, torch.from_numpy(rest.astype(np.float32))], dim=1)
+    return Gaussians(
+        means=ranged(_unpack(vertex["packed_position"], _SIZE_BITS), "x", "y", "z"),
+        log_scales=ranged(_unpack(vertex["packed_scale"], _SIZE_BITS), "scale_x", "scale_y", "scale_z"),
+        rotations=torch.from_numpy(whole_quaternions(vertex["packed_rotation"] >> 30, rotation)),
+        logit_opacities=torch.logit(torch.from_numpy(colour[:, 3].astype(np.float32))),
+        sh=sh,
     )
 
 
@@ -110,10 +185,10 @@ def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint3
     largest, smaller = smallest_three(gaussians.rotations.numpy())
     rotation = _pack((smaller * np.sqrt(0.5) + 0.5).astype(np.float32), (10, 10, 10))
     packed = [
-        _pack(position, (11, 10, 11)),
+        _pack(position, _SIZE_BITS),
         (largest.astype(np.uint32) << np.uint32(30)) | rotation,
-        _pack(scale, (11, 10, 11)),
-        _pack(np.column_stack([colour, alpha]), (8, 8, 8, 8)),
+        _pack(scale, _SIZE_BITS),
+        _pack(np.column_stack([colour, alpha]), _COLOUR_BITS),
     ]
     return np.concatenate(ranges, axis=1), np.stack(packed, axis=1)
 
@@ -128,6 +203,15 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
     return packed
 
 
+def _unpack(packed: NDArray[np.integer[Any]], bits: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the numbers in [0, 1] [N, K] that `_pack` packed."""
+    columns = []
+    for width in reversed(bits):
+        columns.append((packed & (2**width - 1)) / (2**width - 1))
+        packed = packed >> width
+    return np.stack(columns[::-1], axis=1)
+
+
 def smallest_three(
     quaternions: NDArray[np.floating[Any]],  # [N, 4]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # [N], [N, 3]
@@ -138,5 +222,16 @@ def smallest_three(
     unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)
     unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    return largest, np.take_along_axis(unit, others, axis=1)
+    return largest, np.take_along_axis(unit, _OTHERS[largest], axis=1)
+
+
+def whole_quaternions(
+    largest: NDArray[np.integer[Any]],  # [N]
+    smaller: NDArray[np.float64],  # [N, 3]
+) -> NDArray[np.float32]:  # [N, 4]
+    """Return the unit quaternions of the parts that `smallest_three` returns."""
+    unit = np.empty((len(largest), 4))
+    np.put_along_axis(unit, _OTHERS[largest], smaller, axis=1)
+    left = np.sqrt(np.maximum(0.0, 1.0 - (smaller**2).sum(axis=1)))
+    np.put_along_axis(unit, largest.astype(np.int64)[:, None], left[:, None], axis=1)
+    return unit.astype(np.float32)

@@ -5,59 +5,39 @@ Formats differ in their axes. A `Scene` has those of COLMAP and of the Inria PLY
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
-from cleargs.errors import InputError
-from cleargs.files import atomic_path, write_bytes
+from cleargs.errors import InputError, StoreError
+from cleargs.files import write_bytes
 from cleargs.plugins import load_plugin, plugins
-from cleargs.splat.compressed_ply import compressed_ply
+from cleargs.safe_io import FAULTS, faults_as, read_bytes
+from cleargs.splat.compressed_ply import compressed_ply, compressed_remarks
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.glb import glb
-from cleargs.splat.ply import write_ply
+from cleargs.splat.glb import from_glb, glb
+from cleargs.splat.ply import READ, read_ply, write_ply
 from cleargs.splat.scene import Scene
-from cleargs.splat.sog import sog
-from cleargs.splat.spz import spz
+from cleargs.splat.sog import from_sog, sog
+from cleargs.splat.spz import SpzVersion, from_spz, spz, spz_remarks
 from cleargs.splat.transforms import transform_scene
+from cleargs.splat.usd import read_usd, write_usd
 
 _AS_IS = (1.0, 1.0, 1.0)
 _ABOUT_X = (1.0, -1.0, -1.0)  # to x right, y up, z back: the axes of SPZ
 _ABOUT_Z = (-1.0, -1.0, 1.0)  # to x left, y up, z forward: glTF, and PLYs in the tools of PlayCanvas
+_FAULTS = (*FAULTS, RuntimeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, cv2.error)
 
 
-def write_usd(path: Path, scene: Scene) -> None:
-    """Write a scene whose y axis is up as ParticleField3DGaussianSplat of OpenUSD, atomically.
-
-    Raises InputError if OpenUSD 26.03 or later (the extra ``usd``) is not installed.
-    """
-    try:
-        from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
-
-        schema = UsdVol.ParticleField3DGaussianSplat
-    except (ImportError, AttributeError) as error:
-        raise InputError(
-            "OpenUSD 26.03 or later is not installed", hint="pip install 'cleargs[usd]', or export a .glb"
-        ) from error
-    gaussians = scene.gaussians.to("cpu").detach()
-    unit = torch.nn.functional.normalize(gaussians.rotations.double(), dim=1).tolist()
-    with atomic_path(path) as temporary:
-        stage = Usd.Stage.CreateNew(str(temporary))
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-        splats = schema.Define(stage, "/scene")
-        stage.SetDefaultPrim(splats.GetPrim())
-        splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(gaussians.means.numpy()))
-        splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(gaussians.log_scales.exp().numpy()))
-        splats.CreateOrientationsAttr(Vt.QuatfArray([Gf.Quatf(*quaternion) for quaternion in unit]))
-        splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(torch.sigmoid(gaussians.logit_opacities).numpy()))
-        splats.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
-        splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(
-            Vt.Vec3fArray.FromNumpy(gaussians.sh.reshape(-1, 3).contiguous().numpy())
-        )
-        stage.Save()
+def _no_antialiasing(scene: Scene) -> list[str]:
+    lost = "it cannot say that the scene is anti-aliased, so small things look too bold; .sog can"
+    return [lost] if scene.antialias else []
 
 
 @dataclass(frozen=True)
@@ -70,15 +50,39 @@ class Format:
     """Signs of the axes of a `Scene` in the file: no rotation, or half a turn about one axis."""
     y_up: bool = False
     """True: y is always up in the format."""
+    read: Callable[[Path], Scene] | None = None
+    """Function that reads a scene with the axes of the format."""
+    remarks: Callable[[Scene], list[str]] = lambda scene: []
+    """Function that names what the format loses of a scene."""
 
 
 FORMATS: Mapping[str, Format] = {
-    "compressed.ply": Format(lambda path, scene: write_bytes(path, compressed_ply(scene)), _AS_IS),
-    "ply": Format(write_ply, _AS_IS),
-    "sog": Format(lambda path, scene: write_bytes(path, sog(scene)), _AS_IS),
-    "spz": Format(lambda path, scene: write_bytes(path, spz(scene)), _ABOUT_X),
-    "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z, y_up=True),
-    "usdc": Format(write_usd, _ABOUT_Z, y_up=True),
+    "compressed.ply": Format(
+        lambda path, scene: write_bytes(path, compressed_ply(scene)),
+        _AS_IS,
+        read=read_ply,
+        remarks=compressed_remarks,
+    ),
+    "ply": Format(write_ply, _AS_IS, read=read_ply),
+    "sog": Format(
+        lambda path, scene: write_bytes(path, sog(scene)),
+        _AS_IS,
+        read=lambda path: from_sog(read_bytes(path)),
+    ),
+    "spz": Format(
+        lambda path, scene: write_bytes(path, spz(scene)),
+        _ABOUT_X,
+        read=lambda path: from_spz(read_bytes(path)),
+        remarks=spz_remarks,
+    ),
+    "glb": Format(
+        lambda path, scene: write_bytes(path, glb(scene)),
+        _ABOUT_Z,
+        y_up=True,
+        read=lambda path: from_glb(read_bytes(path)),
+        remarks=_no_antialiasing,
+    ),
+    "usdc": Format(write_usd, _ABOUT_Z, y_up=True, read=read_usd, remarks=_no_antialiasing),
 }
 """File extension -> format. `format_of` takes the first match, so longer extensions come first."""
 
@@ -110,15 +114,42 @@ def check_up(kind: str, up: str | None) -> None:
         raise InputError(f"in .{kind} files y is always up", hint="give --up y, or omit --up")
 
 
-def write_scene(path: Path, scene: Scene, kind: str, *, turned: bool = False) -> None:
-    """Write a scene atomically in the format ``kind``, as `format_of` returns it.
+def write_scene(
+    path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: SpzVersion = 3
+) -> list[str]:
+    """Write a scene atomically in the format ``kind``, as `format_of` returns it. Return what is lost.
 
     The scene is rotated to the axes of the file unless it is ``turned`` already.
     """
     target = _format(kind)
-    if target.axes != _AS_IS and not turned:
-        scene = transform_scene(scene, scale=1.0, rotation=np.diag(target.axes), translation=np.zeros(3))
-    target.write(path, scene)
+    with faults_as(InputError, f"cannot write {path}", hint="remove these Gaussians"):
+        scene = replace(scene, gaussians=scene.gaussians.bounded())
+    if not turned:
+        scene = _turned(scene, target)
+    if kind == "spz":
+        write_bytes(path, spz(scene, spz_version))
+    else:
+        target.write(path, scene)
+    return [f"{path.name}: {remark}" for remark in target.remarks(scene)]
+
+
+def read_scene(path: Path) -> Scene:
+    """Read a scene file of any of the `FORMATS`, by its extension; without a known one, it is read as a PLY.
+
+    The result has the axes of a `Scene`. Raises StoreError if the file is missing or cannot be read, and
+    InputError if it is a .usdc and OpenUSD is not installed.
+    """
+    kind = next((kind for kind in FORMATS if path.name.lower().endswith(f".{kind}")), "ply")
+    read = FORMATS[kind].read or read_ply
+    with faults_as(StoreError, f"cannot read the scene {path}", hint=READ, faults=_FAULTS):
+        return _turned(read(path), FORMATS[kind])
+
+
+def _turned(scene: Scene, target: Format) -> Scene:
+    """Turn a scene between the axes of a `Scene` and those of ``target``; half a turn is its own inverse."""
+    if target.axes == _AS_IS:
+        return scene
+    return transform_scene(scene, scale=1.0, rotation=np.diag(target.axes), translation=np.zeros(3))
 
 
 def padded(scene: Scene, sh_degree: int) -> Scene:

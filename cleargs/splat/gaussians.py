@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -10,6 +11,12 @@ from torch import Tensor
 
 from cleargs.errors import InputError
 from cleargs.splat.constants import SH_DEGREES
+
+OPAQUE = 16.0
+"""Logit that replaces an infinite one; its opacity is 1 - 1e-7."""
+
+FLAT = -40.0
+"""Log scale that replaces minus infinity."""
 
 
 @dataclass
@@ -95,6 +102,23 @@ class Gaussians:
     def select(self, index: Tensor) -> Gaussians:
         """Return contiguous copies of the Gaussians at ``index``, a bool mask [N] or indices."""
         return Gaussians(**{name: tensor[index].contiguous() for name, tensor in self.tensors().items()})
+
+    def bounded(self) -> Gaussians:
+        """Return the Gaussians without infinite opacities (`OPAQUE`), zero sizes (`FLAT`) and zero rotations.
+
+        Files of other programs have all three. Raises ValueError if another value is not finite.
+        """
+        nan, identity = float("nan"), self.rotations.new_tensor([1.0, 0.0, 0.0, 0.0])
+        unset = (self.rotations == 0.0).all(dim=1, keepdim=True)
+        tensors = self.tensors() | {
+            "logit_opacities": torch.nan_to_num(self.logit_opacities, nan, OPAQUE, -OPAQUE),
+            "log_scales": torch.nan_to_num(self.log_scales, nan, math.inf, FLAT),
+            "rotations": torch.where(unset, identity, self.rotations),
+        }
+        found = Gaussians(**tensors)
+        if fault := found.fault():
+            raise ValueError(fault)
+        return found
 
     def fault(self) -> str | None:
         """Name the first parameter with NaN or infinity, and its number of such Gaussians; None if finite."""

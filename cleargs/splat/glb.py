@@ -1,8 +1,8 @@
 """``.glb`` with KHR_gaussian_splatting: points whose attributes are the parameters of Gaussians.
 
 Scales and opacities are stored after activation (standard deviations, and 0 to 1), rotations as x y z w, and
-spherical harmonics unchanged. Programs without the extension show coloured points from COLOR_0. Source: the
-specification of the Khronos extension.
+spherical harmonics unchanged. Programs without the extension show coloured points from COLOR_0, which is
+linear. Source: the specification of the Khronos extension (release candidate of July 2026).
 """
 
 from __future__ import annotations
@@ -15,12 +15,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cleargs.splat.constants import SH_C0
+from cleargs.media.colour import linear_from_srgb
+from cleargs.splat.constants import SH_C0, SH_DEGREES
+from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
 _NAME = "KHR_gaussian_splatting"
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_PLACES = {"matrix", "translation", "rotation", "scale"}
+_NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 
 
 def glb(scene: Scene) -> bytes:
@@ -81,10 +85,10 @@ def _columns(scene: Scene) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]
     sh = gaussians.sh.numpy()
     alpha = torch.sigmoid(gaussians.logit_opacities).numpy()[:, None]
     unit = torch.nn.functional.normalize(gaussians.rotations.double(), dim=1).float().numpy()
-    colour = np.concatenate([sh[:, 0] * SH_C0 + 0.5, alpha], axis=1)
+    colour = np.concatenate([linear_from_srgb((sh[:, 0] * SH_C0 + 0.5).clip(0, 1)), alpha], axis=1)
     columns: dict[str, NDArray[np.float32] | NDArray[np.uint8]] = {
         "POSITION": gaussians.means.numpy(),
-        "COLOR_0": np.rint(colour.clip(0, 1) * 255).astype(np.uint8),
+        "COLOR_0": np.rint(colour * 255).astype(np.uint8),
         f"{_NAME}:ROTATION": np.ascontiguousarray(unit[:, [1, 2, 3, 0]]),
         f"{_NAME}:SCALE": gaussians.log_scales.exp().numpy(),
         f"{_NAME}:OPACITY": alpha,
@@ -94,3 +98,48 @@ def _columns(scene: Scene) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]
             name = f"{_NAME}:SH_DEGREE_{degree}_COEF_{index}"
             columns[name] = np.ascontiguousarray(sh[:, degree**2 + index])
     return columns
+
+
+def from_glb(content: bytes) -> Scene:
+    """Decode the Gaussians of a glb. Raises one of `cleargs.safe_io.FAULTS` if it is another file."""
+    magic, _, _, length, kind = struct.unpack_from("<4sIII4s", content)
+    if (magic, kind) != (b"glTF", b"JSON"):
+        raise ValueError("not a .glb")
+    document, data = json.loads(content[20 : 20 + length]), content[28 + length :]
+    primitives = [
+        primitive
+        for mesh in document.get("meshes", [])
+        for primitive in mesh["primitives"]
+        if _NAME in primitive.get("extensions", {})
+    ]
+    placed = [node for node in document.get("nodes", []) if node.keys() & _PLACES]
+    if len(primitives) != 1 or placed or primitives[0]["extensions"][_NAME].get("extensions"):
+        raise ValueError(f"it does not have exactly one uncompressed {_NAME} without a transform")
+    attributes = primitives[0]["attributes"]
+
+    def get(name: str) -> torch.Tensor:
+        accessor = document["accessors"][attributes[name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        number = np.dtype(_NUMBERS[accessor["componentType"]])
+        width = {kind: width for width, kind in _KINDS.items()}[accessor["type"]]
+        values: NDArray[Any] = np.ndarray(
+            (accessor["count"], width),
+            number,
+            data,
+            view.get("byteOffset", 0) + accessor.get("byteOffset", 0),
+            (view.get("byteStride", number.itemsize * width), number.itemsize),
+        )
+        largest = np.iinfo(number).max if number.kind != "f" else 1
+        return torch.from_numpy((values / largest).astype(np.float32))
+
+    names = [name for name in attributes if name.startswith(f"{_NAME}:SH_DEGREE_")]
+    degree = SH_DEGREES[len(names)]
+    terms = [(level, term) for level in range(degree + 1) for term in range(2 * level + 1)]
+    gaussians = Gaussians(
+        means=get("POSITION"),
+        log_scales=get(f"{_NAME}:SCALE").log(),
+        rotations=get(f"{_NAME}:ROTATION")[:, [3, 0, 1, 2]],
+        logit_opacities=torch.logit(get(f"{_NAME}:OPACITY")[:, 0]),
+        sh=torch.stack([get(f"{_NAME}:SH_DEGREE_{level}_COEF_{term}") for level, term in terms], dim=1),
+    )
+    return Scene(gaussians.bounded())

@@ -22,7 +22,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cleargs.splat.compressed_ply import LOG_SCALE_MAX, morton_order, smallest_three
+from cleargs.safe_io import MAX_BYTES
+from cleargs.splat.compressed_ply import LOG_SCALE_MAX, morton_order, smallest_three, whole_quaternions
+from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.types import ImageU8
 
@@ -83,6 +85,52 @@ def sog(scene: Scene) -> bytes:
         for name, image in images.items():
             archive.writestr(zipfile.ZipInfo(f"{name}.webp", _ZIP_DATE), _webp(image))
     return content.getvalue()
+
+
+def from_sog(content: bytes) -> Scene:
+    """Decode a scene of version 2. Raises a fault of the decoders if it is another file."""
+    archive = zipfile.ZipFile(io.BytesIO(content))
+    if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+        raise ValueError("it is too large")
+    meta = json.loads(archive.read("meta.json"))
+    if meta.get("version") != 2:
+        raise ValueError("not a .sog of version 2")
+    count = int(meta["count"])
+
+    def image(part: str, index: int = 0) -> ImageU8:  # [H, W, 4]
+        found = cv2.imdecode(
+            np.frombuffer(archive.read(meta[part]["files"][index]), np.uint8), cv2.IMREAD_UNCHANGED
+        )
+        if found is None or found.ndim != 3:
+            raise ValueError(f"its image of {part} cannot be decoded")
+        order = cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGBA
+        return np.asarray(cv2.cvtColor(found, order), np.uint8)
+
+    def pixels(part: str, index: int = 0) -> ImageU8:  # [N, 4]
+        return image(part, index).reshape(-1, 4)[:count]
+
+    low, high = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    steps = pixels("means")[:, :3] + 256.0 * pixels("means", 1)[:, :3]
+    logs = low + steps / 65535.0 * (high - low)
+    quaternions, colours = pixels("quats"), pixels("sh0")
+    sh = np.array(meta["sh0"]["codebook"])[colours[:, None, :3]]
+    if meta.get("shN"):
+        codes = np.array(meta["shN"]["codebook"])[image("shN")[..., :3]]
+        labels = pixels("shN", 1)[:, :2] @ np.array([1, 256])
+        sh = np.concatenate([sh, codes.reshape(-1, codes.shape[1] // _PALETTE_ROW, 3)[labels]], axis=1)
+    tensors = {
+        "means": np.sign(logs) * np.expm1(np.abs(logs)),
+        "log_scales": np.array(meta["scales"]["codebook"])[pixels("scales")[:, :3]],
+        "rotations": whole_quaternions(
+            quaternions[:, 3] - np.uint8(252), (quaternions[:, :3] / 127.5 - 1.0) * np.sqrt(0.5)
+        ),
+        "logit_opacities": torch.logit(torch.from_numpy(colours[:, 3] / 255.0)).numpy(),
+        "sh": sh,
+    }
+    gaussians = Gaussians(
+        **{name: torch.from_numpy(tensor.astype(np.float32)) for name, tensor in tensors.items()}
+    )
+    return Scene(gaussians.bounded(), antialias=meta.get("model") == "antialiased")
 
 
 def _harmonics(

@@ -129,5 +129,13 @@ def test_time_limit_and_lost_node_cost_no_finished_work(toys: ToyBatch, slurm: S
 
 
 def test_the_profile_warns_before_the_time_limit() -> None:
-    assert "--signal=TERM@120" in (WORKFLOWS / "profiles" / "slurm" / "config.yaml").read_text()
+    profile = (WORKFLOWS / "profiles" / "slurm" / "config.yaml").read_text()
+    assert "--signal=TERM@120" in profile
+
+
+def test_the_profile_asks_squeue_where_jobs_are_forgotten_soon() -> None:
+    """The plug-in asks sacct, which needs accounting, where MinJobAge is below three times these seconds."""
+    lines = (WORKFLOWS / "profiles" / "slurm" / "config.yaml").read_text().splitlines()
+    (seconds,) = (line.split()[1] for line in lines if line.startswith("slurm-init-seconds-before-status"))
+    assert 3 * int(seconds) < 60 and "slurm-status-command: squeue" in "\n".join(lines)
     assert os.access(WORKFLOWS / "Snakefile", os.R_OK)

@@ -20,7 +20,7 @@ from eval_world import cameras, make_scene, write_run
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
 from cleargs.render.pruning import crop_scene
-from cleargs.splat.formats import padded
+from cleargs.splat.formats import padded, read_scene
 from cleargs.splat.ply import read_ply
 
 
@@ -98,3 +98,57 @@ def test_map_coordinates_keep_their_precision(
     assert float(near.means.abs().max()) < 100 and len(near.means[:, 0].unique()) == 20
     first = json.loads((tmp_path / "x.cameras.json").read_text())[0]["position"]
     assert np.abs(first).max() < 100  # all files share the offset
+
+
+def test_a_file_of_another_program_is_exported(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Such a file has no run, so no cameras."""
+    assert invoke(["export", str(run), "-o", str(tmp_path / "x.sog")]) == 0
+    assert invoke(["export", str(tmp_path / "x.sog"), "-o", str(tmp_path / "y.ply"), "--up", "y"]) == 0
+    assert "scene of x.sog" in capsys.readouterr().out
+    own, turned = read_scene(tmp_path / "x.sog").gaussians, read_ply(tmp_path / "y.ply").gaussians
+    assert torch.allclose(turned.means, own.means * torch.tensor([1.0, -1.0, -1.0]), atol=1e-5)
+    for wrong in (["--metres", "0-1=2"], ["--world", "input"], ["--prune", "opacity:0.1"], ["--cameras"]):
+        assert invoke(["export", str(tmp_path / "x.sog"), "-o", str(tmp_path / "z.ply"), *wrong]) == 2
+        assert "need the cameras of a run" in capsys.readouterr().err
+    assert invoke(["export", str(tmp_path / "x.sog"), "-o", str(tmp_path / "z.ply"), "--stage", "g0"]) == 2
+    assert "leave it out for a file" in capsys.readouterr().err
+    before = (tmp_path / "x.sog").read_bytes()
+    assert invoke(["export", str(tmp_path / "x.sog"), "-o", str(tmp_path / "x.sog"), "--force"]) == 2
+    assert (tmp_path / "x.sog").read_bytes() == before
+
+
+def test_a_file_that_is_no_scene_names_what_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.spz").write_bytes(b"no scene")
+    assert invoke(["export", str(tmp_path / "x.spz"), "-o", str(tmp_path / "y.ply")]) != 0
+    cause, remedy = capsys.readouterr().err.splitlines()
+    assert "cannot read the scene" in cause and ".compressed.ply" in remedy and "stage" not in remedy
+
+
+def test_playcanvas_gets_version_4_of_spz(run: Path, tmp_path: Path) -> None:
+    """Its engine refuses version 3; the others read only that."""
+    for arguments, start in (
+        (["--for", "playcanvas"], b"NGSP\x04"),
+        (["--for", "web"], b"\x1f\x8b"),
+        (["--for", "web", "--spz", "4"], b"NGSP\x04"),
+        ([], b"\x1f\x8b"),
+    ):
+        path = tmp_path / "x.spz"
+        assert invoke(["export", str(run), "-o", str(path), "--force", *arguments]) == 0
+        assert path.read_bytes().startswith(start)
+
+
+def test_what_a_format_loses_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Anti-aliasing was lost without a word, and a small world destroyed."""
+    run = write_run(tmp_path / "aa", replace(make_scene(count=20), antialias=True), cameras())
+    write_sparse(run / "ingest")
+    assert invoke(["export", str(run), "-o", str(tmp_path / "x.glb")]) == 0
+    assert "anti-aliased" in capsys.readouterr().out
+    assert invoke(["export", str(run), "-o", str(tmp_path / "x.sog"), "-o", str(tmp_path / "x.spz")]) == 0
+    assert "anti-aliased" not in capsys.readouterr().out
+    assert invoke(["export", str(run), "-o", str(tmp_path / "y.spz"), "--metres", "0-1=0.00001"]) == 2
+    cause, remedy = capsys.readouterr().err.splitlines()
+    assert "cannot hold" in cause and ".sog" in remedy and not (tmp_path / "y.spz").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from pathlib import Path
 
@@ -28,9 +29,10 @@ def pair(height: int = 61, width: int = 83) -> tuple[NDArray[np.uint8], NDArray[
 
 
 def test_psnr_and_ssim_equal_those_of_torchmetrics() -> None:
-    image_metrics = pytest.importorskip(
-        "torchmetrics.functional.image", reason="torchmetrics is not installed"
-    )
+    try:
+        image_metrics = importlib.import_module("torchmetrics.functional.image")
+    except Exception as error:  # it imports torchvision, whose build for another torch raises RuntimeError
+        pytest.skip(f"torchmetrics cannot be imported: {error}")
     a, b = pair()
     planes = [torch.from_numpy(x).permute(2, 0, 1)[None].double() / 255 for x in (a, b)]
     expected = image_metrics.structural_similarity_index_measure(*planes, data_range=1.0)

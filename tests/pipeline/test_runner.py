@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from toy import Bench
 
-from cleargs.digest import DigestMemo
+from cleargs.digest import DigestMemo, json_digest
 from cleargs.errors import InputError, StageError, StoreError
-from cleargs.manifest import read_manifest, write_manifest
+from cleargs.files import write_json
+from cleargs.manifest import MANIFEST, read_manifest, write_manifest
+from cleargs.parquet import column, table_meanings, write_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.runner import Runner, check_same_input
@@ -379,3 +383,26 @@ def test_missing_file_of_a_late_stage_is_noticed_before_work(bench: Bench, tmp_p
     with pytest.raises(InputError, match=r"nowhere\.onnx"):
         bench.run()
     assert bench.work_done() == [] and not bench.folder.exists()
+
+
+def test_meanings_of_columns_are_repeated_in_the_manifest(tmp_path: Path) -> None:
+    """pandas, polars and duckdb drop those in the files. `table_meanings` fills ``Manifest.columns``."""
+    schema = pa.schema(
+        [column("weight", pa.float64(), "share of the loss, 0 to 1"), pa.field("n", pa.int32())]
+    )
+    (tmp_path / "part").mkdir()
+    write_table(tmp_path / "part/t.parquet", pa.table({"weight": [0.5], "n": [1]}), schema)
+    (tmp_path / "note.txt").write_text("not a table")
+    assert table_meanings(tmp_path, ["part/t.parquet", "note.txt"]) == {
+        "part/t.parquet": {"weight": "share of the loss, 0 to 1", "n": ""}
+    }
+
+
+def test_a_manifest_of_an_older_version_has_no_meanings(bench: Bench) -> None:
+    bench.run()
+    content = json.loads((bench.folder / "count" / MANIFEST).read_text())
+    del content["columns"], content["seal"]
+    folder = bench.folder / "older"
+    folder.mkdir()
+    write_json(folder / MANIFEST, {**content, "seal": json_digest(content)})
+    assert read_manifest(folder).columns == {}

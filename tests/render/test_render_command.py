@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -266,3 +267,19 @@ def test_an_interrupted_render_leaves_nothing(
         rendered.clear()
         assert render(run, output, "--fps", "5", "--seconds", "2") == 130
         assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_file_is_rendered_at_given_poses(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The pictures are those of the run, at the poses that its export wrote."""
+    document = cameras_json([(str(index), camera) for index, camera in enumerate(cameras())])
+    (tmp_path / "cameras.json").write_text(json.dumps(document))
+    shutil.copy(run / "g0" / "scene.ply", tmp_path / "other.ply")
+    poses = ["--poses", str(tmp_path / "cameras.json")]
+    assert render(run, tmp_path / "run" / "%d.png", *poses) == 0
+    assert render(tmp_path / "other.ply", tmp_path / "file" / "%d.png", *poses) == 0
+    for name in ("0.png", "5.png"):
+        assert np.array_equal(read_rgb(tmp_path / "run" / name), read_rgb(tmp_path / "file" / name))
+    assert render(tmp_path / "other.ply", tmp_path / "x.mp4") == 2
+    assert "--poses" in capsys.readouterr().err

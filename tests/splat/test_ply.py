@@ -47,7 +47,7 @@ def test_plyfile_reads_the_inria_layout(sh_degree: int, tmp_path: Path) -> None:
         for colour in range(3):
             column = vertex[f"f_rest_{colour * (coefficients - 1) + term - 1}"]
             assert np.array_equal(column, gaussians.sh[:, term, colour].numpy())
-    assert f"cleargs antialias {'mip' if made.antialias else 'none'}" in ply.comments
+    assert f"SplatRenderMode: {'mip' if made.antialias else 'default'}" in ply.comments
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
