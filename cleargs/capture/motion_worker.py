@@ -72,6 +72,11 @@ class _Frame:
     points: NDArray[np.int64]  # [P] numbers of the tracked points
     times: ArrayF64  # [1 + K]
 
+    @property
+    def two_sided(self) -> bool:
+        """True if the frame has neighbours before and after it, and so a path of full order."""
+        return bool(self.times.min() < 0.0 < self.times.max())
+
 
 class _Capture:
     """Geometry, tracks and motions of the frames of a model, in the order of its images."""
@@ -175,7 +180,7 @@ class _Capture:
         found: Readout | None = None
         for _ in range(ROUNDS):
             readout = 0.0 if found is None else found.seconds
-            motions = {n: self._motion(n, readout, columns) for n in members}
+            motions = {n: self._motion(n, readout, columns) for n in members if self._frames[n].two_sided}
             errors = [motion.error_px for motion in motions.values() if motion is not None]
             known = {n: motion for n, motion in motions.items() if motion is not None}
             if len(known) < MIN_FRAMES:

@@ -18,6 +18,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from statistics import median
 from typing import Literal
 
 import numpy as np
@@ -56,6 +57,9 @@ search. It doubles from one try to the next, because the scene changes less and 
 SETTLED = 7
 """Looks at a frame after which later trainings keep its formation. Scenes lost nothing after 7 and 15 looks,
 and up to 0.2 dB after 3 (docs/experiments/formation.md)."""
+CLEAR_BLUR, EXPOSED_FRAMES, MIN_EXPOSED_FRAMES = 3.0, 9, 3
+"""Blur, px, that shows the exposure time of its frame; largest and smallest number of frames around a frame
+from which its exposure time is known."""
 MEASURED_SHARE = 0.5
 """Least share of the frames with a measured motion, at which ingest decides if the shutter rolls."""
 SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
@@ -215,9 +219,23 @@ class CaptureFormation:
             shutter="rolls" if self._rolls(frame_id) else tested,
             curve=_searched_again(frame.draws // self._config.every),
             sparing=self._draft or self._sharp(),
+            exposure_s=self._exposure(frame_id),
             measured=self._measured.get(frame_id),
         )
         return fit_motion(frame, self._config, shot, terms)
+
+    def _exposure(self, frame_id: int) -> float:
+        """Return the median exposure time, s, of the nearest frames whose blur is a measured motion; else 0.
+
+        Automatic exposure changes slowly, and every frame is exposed, also where little blur shows it.
+        """
+        blurred = [
+            (abs(k - frame_id), frame.motion.exposure_s)
+            for k, frame in self._frames.items()
+            if k != frame_id and frame.motion.exposure_s > 0.0 and frame.blur_px >= CLEAR_BLUR
+        ]
+        nearest = [seconds for _, seconds in sorted(blurred)[:EXPOSED_FRAMES]]
+        return median(nearest) if len(nearest) >= MIN_EXPOSED_FRAMES else 0.0
 
     def digest(self) -> str:
         """Return a digest of the settings and of the formations at the start."""

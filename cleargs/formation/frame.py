@@ -36,6 +36,7 @@ from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.kernels.warp_layout import BEND_REACH, CHANNELS, CUBE_REACH, DisplacementFields
 from cleargs.splat.types import Render
+from cleargs.types import ArrayF64
 
 EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
 """Evidence of blur above which a frame is searched. The second value is for frames that RVA doubts. Both are
@@ -56,6 +57,9 @@ MARGIN_SHARE = 0.25
 
 EXPOSURES = np.geomspace(1 / 16, 3.0, 18)
 """Exposure times that are tried with a measured motion, in frames of the video."""
+
+NEARER = np.array([0.85, 0.92, 1.0, 1.08, 1.17])
+"""Exposure times that are tried around the best of these, as factors."""
 
 LENS = ("disc_px", "focus", "median_depth", "exposure_s")
 MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
@@ -142,6 +146,8 @@ class Terms:
     """Try a higher order of the path, and search a frame with a curved path or a rolling shutter."""
     sparing: bool = False
     """Also the first time, search only for a blur that the test and `_Look._resembles` admit."""
+    exposure_s: float = 0.0
+    """Exposure time of the frames around this one, s; 0: it is not known."""
     measured: MeasuredPath | None = None
     """Motion that ingest measured. Its skew replaces all others, and its blur the first search."""
 
@@ -169,12 +175,12 @@ def fit_motion(
     """
     look = _Look(frame, config, shot, terms)
     found = look.followed()
-    best = look.accepted(preferred(found[1:] or found), found[0])
+    best = look.accepted(found[1:] or found, found[0])
     evidence = look.unexplained(best)
     if look.reason(found, best, evidence) is None:
         return look.described(best, min(frame.evidence, evidence.gain))
     found = look.searched(found, best, evidence)
-    best = look.accepted(preferred(found), found[0])
+    best = look.accepted(found, found[0])
     return look.described(best, look.unexplained(best).gain)
 
 
@@ -232,11 +238,17 @@ class _Look:
                 path = replace(path, bend=known.bend, cube=known.cube)
             path = replace(path, pose=known.pose, blur=known.blur, skew=known.skew)
             found.append(self._corrected(measured, path))
+        if self._terms.exposure_s > 0.0:
+            found += self._best_of(measured, np.array([self._terms.exposure_s]))
         if self._frame.draws == 0 or self._terms.curve:
-            times = EXPOSURES * measured.frame_s
-            fits = measured_fits(self._pair, [self._exposed(measured, float(time)) for time in times])
-            found += [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.misfit).motion)]
+            coarse = self._best_of(measured, EXPOSURES * measured.frame_s)[0].motion.exposure_s
+            found += self._best_of(measured, NEARER * coarse)
         return found
+
+    def _best_of(self, measured: MeasuredPath, times: ArrayF64) -> list[MotionFit]:
+        """Return fits of the measured motion during the exposure of ``times`` that explains most."""
+        fits = measured_fits(self._pair, [self._exposed(measured, float(time)) for time in times])
+        return [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.misfit).motion)]
 
     def _exposed(self, measured: MeasuredPath, seconds: float) -> FrameMotion:
         return measured.exposed(seconds, self._shot.camera, finest_level(self._pair).median)
@@ -245,16 +257,22 @@ class _Look:
         known = measured.measurement(path.exposure_s, self._shot.camera, path.median_depth)
         return corrected(self._pair, path, known, pose=self._terms.pose)
 
-    def accepted(self, best: MotionFit, still: MotionFit) -> MotionFit:
-        """Return ``best`` if it explains enough more than ``still``, else ``still``.
+    def accepted(self, found: list[MotionFit], still: MotionFit) -> MotionFit:
+        """Return the best of ``found`` that explains enough more than ``still``, else ``still``.
 
-        The model that the frame had needs only half as much, and so does a measured motion.
+        The model that the frame had needs only half as much, and so does a measured motion. A measured motion
+        during the exposure time of the frames around it must only explain no less.
         """
+        best = preferred(found)
         if best.model == still.model:
             return min(best, still, key=lambda fit: fit.misfit)
         known = best.model == self._frame.model or best.motion.exposure_s > 0.0
         gain = explained_share(best.misfit, still.misfit)
-        return best if gain >= self._config.accept * (0.5 if known else 1.0) else still
+        if gain >= self._config.accept * (0.5 if known else 1.0):
+            return best
+        alike = [fit for fit in found if 0.0 < fit.motion.exposure_s == self._terms.exposure_s]
+        exposed = min(alike, key=lambda fit: fit.misfit, default=still)
+        return exposed if exposed.misfit <= still.misfit else still
 
     def unexplained(self, fit: MotionFit) -> BlurEvidence:
         """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
