@@ -116,7 +116,7 @@ def plot(found: Comparison, path: Path) -> None:
         axis.set_ylabel(f"{name}, px per frame")
     axes[1].set_xlabel("time, s")
     axes[0].legend(loc="upper left", ncols=3, frameon=False)
-    figure.savefig(path)
+    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
     pyplot.close(figure)
 
 
