@@ -77,7 +77,7 @@ class MeasuredMotion:
 def track(
     frame: ImageU8,  # [H, W] grey
     neighbours: Sequence[ImageU8],
-    times: Sequence[float],  # of the neighbours, s after the frame
+    times: Sequence[float],  # times of the neighbours, s after the frame
     xy: ArrayF64,  # [P, 2] px; the centre of the first pixel is 0.5
 ) -> ArrayF64:  # [K, P, 2] px
     """Follow keypoints of a frame into its neighbours by pyramidal flow (Lucas and Kanade).

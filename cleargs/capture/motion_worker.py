@@ -1,6 +1,6 @@
 """Measurement of motion and readout: ``python -m cleargs.capture.motion_worker job.json``.
 
-A process of its own, with one thread in its linear algebra, so that its sums do not depend on threads.
+A separate process, with one thread in its linear algebra, so that its sums do not depend on threads.
 """
 
 from __future__ import annotations
@@ -119,20 +119,17 @@ class _Capture:
             np.zeros((len(images), ORDER, TWIST)),
             np.ones(len(images)),
         )
-        self._rows = np.zeros(len(images)), np.zeros(len(images), bool)
+        self._seconds, self._columns = np.zeros(len(images)), np.zeros(len(images), bool)
         self.motions: dict[str, MeasuredMotion] = {}
         self._measure()
 
     def _measure(self) -> None:
         """Measure the motion of all frames with the present geometry and readouts."""
         self.motions = {}
-        for number in range(len(self._frames)):
-            self._measure_frame(number, self._rows[0][number], bool(self._rows[1][number]))
-
-    def _measure_frame(self, number: int, readout: float, columns: bool) -> None:
-        motion = self._motion(number, readout, columns)
-        if motion is not None:
-            self.motions[self._frames[number].image] = motion
+        for number, frame in enumerate(self._frames):
+            motion = self._motion(number, float(self._seconds[number]), bool(self._columns[number]))
+            if motion is not None:
+                self.motions[frame.image] = motion
 
     def _motion(self, number: int, readout: float, columns: bool) -> MeasuredMotion | None:
         frame, geometry = self._frames[number], self._geometry
@@ -220,20 +217,18 @@ class _Capture:
         """
         by_lens = {found.lens: found for found in readouts}
         known = [by_lens.get(frame.lens) for frame in self._frames]
-        self._rows = (
-            np.array([0.0 if found is None else found.seconds for found in known]),
-            np.array([found is not None and found.columns for found in known]),
-        )
+        self._seconds = np.array([0.0 if found is None else found.seconds for found in known])
+        self._columns = np.array([found is not None and found.columns for found in known])
         for _ in range(ROUNDS):
             self._measure()
             numbers = {
                 n: self.motions[f.image] for n, f in enumerate(self._frames) if f.image in self.motions
             }
             seen = self._with_paths(numbers, False)
-            seconds = self._rows[0][seen.frame]
-            self._seen = replace(seen, row=self._row(self._rows[1]) * seconds)
+            self._seen = replace(seen, row=self._row(self._columns) * self._seconds[seen.frame])
             start = replace(self._geometry, readout=1.0)  # rows are in seconds
-            self._geometry = self._aligned(adjusted(self._seen, start, poses=poses))
+            geometry = adjusted(self._seen, start, poses=poses)
+            self._geometry = self._aligned(geometry) if poses else geometry
         self._measure()
 
     def _aligned(self, geometry: Geometry) -> Geometry:

@@ -152,7 +152,7 @@ def corrected(pair: FramePair, motion: FrameMotion, measured: Measurement, *, po
     unknowns = np.hstack([np.eye(len(active))[:, :TWIST], to_speed]) if pose else to_speed
     total = measured.exposure**2 + measured.readout**2
     speed = (measured.exposure * motion.blur + measured.readout * motion.skew) / total
-    variance = (1.25 * level.evaluate("blur", motion).misfit) ** 2  # of normal errors with this mean
+    variance = (1.25 * level.evaluate("blur", motion).misfit) ** 2  # if errors are normal
     held = np.zeros((unknowns.shape[1], unknowns.shape[1]))
     held[-TWIST:, -TWIST:] = SHARED_PIXELS * variance * measured.precision
     before = np.concatenate([np.zeros(unknowns.shape[1] - TWIST), speed - measured.speed])
