@@ -74,12 +74,20 @@ def test_wrong_tracks_do_not_count() -> None:
     assert in_image(found.path[0] - SPEED, seen) < 0.03 * in_image(SPEED, seen)
 
 
-def test_a_frame_needs_tracks_on_both_sides() -> None:
+def test_the_first_frame_has_neighbours_on_one_side() -> None:
     seen = tracks()
     late = replace(
         seen, places=seen.places[[0, 3, 4]], rows=seen.rows[[0, 3, 4]], times=seen.times[[0, 3, 4]]
     )
-    assert measure(late) is None
+    found, both = measure(late), measure(seen)
+    assert found is not None and both is not None
+    assert in_image(found.path[0] - SPEED, seen) < 0.05 * in_image(SPEED, seen)
+    assert not found.path[2:].any()  # a path of second order
+    assert np.trace(found.covariance) > np.trace(both.covariance)
+
+
+def test_a_frame_needs_enough_tracks() -> None:
+    seen = tracks()
     few = seen.places.copy()
     few[1:, 15:] = np.nan
     assert measure(replace(seen, places=few)) is None
@@ -87,7 +95,7 @@ def test_a_frame_needs_tracks_on_both_sides() -> None:
 
 def test_points_are_followed_and_lost_ones_are_left_out() -> None:
     rng = np.random.default_rng(0)
-    texture = cv2.GaussianBlur(rng.uniform(0, 255, (HEIGHT, WIDTH)).astype(np.float32), (0, 0), 2.0)
+    texture = cv2.GaussianBlur(rng.uniform(0, 255, (HEIGHT, WIDTH)).astype(np.float32), (0, 0), 4.0)
     texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
 
     def shifted(x: float, y: float) -> np.ndarray:
@@ -188,14 +196,15 @@ def numbered(*numbers: int, chosen: tuple[int, ...], frame_rate: float | None = 
 
 def test_images_that_were_not_chosen_are_neighbours_by_their_numbers() -> None:
     found = neighbourhoods(numbered(*range(0, 40, 2), chosen=(0, 10, 38), frame_rate=15.0))
-    assert [one.number for one in found] == [1]  # the first and the last have neighbours on one side
-    assert found[0].times == pytest.approx((-2 / 15, -1 / 15, 1 / 15, 2 / 15))
-    assert [int(other.path.stem) for other in found[0].others] == [6, 8, 12, 14]
+    first, middle, last = found
+    assert middle.times == pytest.approx((-2 / 15, -1 / 15, 1 / 15, 2 / 15))
+    assert [int(other.path.stem) for other in middle.others] == [6, 8, 12, 14]
+    assert first.times == pytest.approx((1 / 15, 2 / 15)) and last.times == pytest.approx((-2 / 15, -1 / 15))
 
 
 def test_a_gap_in_the_numbers_ends_a_neighbourhood() -> None:
     found = neighbourhoods(numbered(1, 2, 3, 4, 20, 21, 22, 23, chosen=(3, 20)))
-    assert [(one.number, one.times) for one in found] == [(0, (-2.0, -1.0, 1.0))]
+    assert [(one.number, one.times) for one in found] == [(0, (-2.0, -1.0, 1.0)), (1, (1.0, 2.0))]
     assert not neighbourhoods(numbered(1, chosen=(1,)))
 
 
