@@ -128,12 +128,12 @@ class Batch:
         InputError if the folder has content and is not a batch, or if the batch would replace its sheet, a
         recipe or a capture, and StoreError if a part of the folder is a link.
         """
-        self._check_folder()
         written = [self.folder / name for name in ("summary.csv", "report", "logs", "exports", "store")]
         for place in (sheet, *(Path(text) for job in self.scenes for text in (job.source, job.recipe))):
             for taken in filter(Place(place, hard_links=False).is_inside, written):
                 hint = "choose another folder with -o"
                 raise InputError(f"the batch would replace {place}: it writes {taken}", hint=hint)
+        self._check_folder()
         problems = []
         for scene in self.scenes:
             try:

@@ -21,6 +21,10 @@ NEAR = 4
 """Number of folders above an output in which runs are searched that may have it as an input."""
 
 
+CAPTURE = ("images", "masks", "sparse", "colmap")
+"""Folders of a capture in which nothing is written: a new file would become a part of it."""
+
+
 def check_outputs(
     outputs: Iterable[Path],
     dag: Dag,
@@ -79,6 +83,7 @@ def _inputs_of(run: Path, dag: Dag, whole: bool) -> Iterator[Path]:
         return
     if not source.is_dir() or (whole and not Place(run).is_inside(source)):
         yield source
+    yield from (source / name for name in CAPTURE if (source / name).is_dir())
     with suppress(CleargsError, OSError):  # a setting may be unknown
         config = read_run_file(run, dag).config.effective
         for name in dag.names:

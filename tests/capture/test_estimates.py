@@ -30,11 +30,10 @@ def photos(tmp_path: Path) -> Path:
 
 
 def costs(source: Path, *overrides: str, threads: int = 2) -> dict[str, Estimate]:
-    run = RunSpec(
-        source.parent / "run", source, load_config(installed(), "default", overrides), source, "cpu"
-    )
+    store = source.parent / "store"
+    run = RunSpec(source.parent / "run", source, load_config(installed(), "default", overrides), store, "cpu")
     with DigestMemo(source.parent / "memo") as memo:
-        planner = Planner(installed(), run, Store(source, memo), threads, SilentReporter())
+        planner = Planner(installed(), run, Store(store, memo), threads, SilentReporter())
         return {plan.stage: plan.estimate for plan in planner.plan() if plan.estimate is not None}
 
 

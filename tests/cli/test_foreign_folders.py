@@ -251,7 +251,7 @@ def test_a_variable_that_a_library_cannot_use_is_named(
     with pytest.raises(ValueError) as raised:
         __import__("noisylib")
     code, cause, _ = main_module.explanation(raised.value)
-    assert code == 2 and f"environment variable {variable} cannot be used" in cause
+    assert code == 2 and f"environment variable {variable}=x cannot be used" in cause
     monkeypatch.delenv(variable)
     assert main_module.explanation(ValueError("ours"))[1].startswith("unexpected ValueError")
 

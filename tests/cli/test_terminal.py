@@ -18,7 +18,6 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.show import _print_table
 from cleargs.cli.terminal import EscapingStream
 from cleargs.errors import InputError
-from cleargs.files import disk_error
 from cleargs.safe_io import printable
 
 CLIPBOARD = "\x1b]52;c;ZXZpbA==\x07"
@@ -106,12 +105,6 @@ def test_out_of_memory_names_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     code, cause, remedy = explanation(MemoryError())
     assert (code, cause) == (1, "out of memory")
     assert "limit on virtual memory, 2.6 GB: ulimit -v unlimited" in remedy
-
-
-def test_a_disk_without_inodes_is_not_called_full(tmp_path: Path) -> None:
-    error = OSError(errno.ENOSPC, "No space left on device")
-    for words in (explanation(error)[1], str(disk_error(error, tmp_path / "a"))):
-        assert words.startswith("no space left for data or files on the disk")
 
 
 @pytest.mark.parametrize(

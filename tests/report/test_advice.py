@@ -19,7 +19,7 @@ from cleargs.digest import DigestMemo
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.run_file import RunSpec
+from cleargs.pipeline.run_file import RunSpec, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.report.advice import Advice, shown_advice
@@ -113,7 +113,7 @@ def test_printed_commands_run_as_printed(
     minutes = [int(re.fullmatch(r"about (\d+) min", shown.time)[1]) for shown in commands]
     assert minutes[0] > minutes[-1] >= 1, "the settings of the command decide, not those of the run"
     monkeypatch.chdir(tmp_path)
-    (finished.folder / "run.toml").unlink()  # so that the run has no other capture
+    write_run_file(run)  # the capture of the run
     for shown in commands:
         program, *words = shlex.split(shown.command)
         assert program == "cleargs" and invoke([*words, "--dry-run"], finished.dag) == 0, (

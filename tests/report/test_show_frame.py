@@ -21,7 +21,7 @@ FOUND = {"model": "blur", "blur_px": 3.25, "explained": 0.625, "weight_before": 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = FinishedRun(tmp_path_factory.mktemp("frame"))
-    numbers = dict.fromkeys(FORMATION.names, 0.0)
+    numbers = dict.fromkeys(FORMATION.names, 0.0) | {"columns": False}
     rows = pa.Table.from_pylist([{**numbers, **FOUND, "frame_id": 2}], FORMATION)
     write_table(run.folder / "consolidate/formation.parquet", rows, FORMATION)
     return run.folder
