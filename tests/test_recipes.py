@@ -188,8 +188,9 @@ def test_a_missing_model_is_an_error_before_any_work(
     settings += [kept] if "=" in kept else []
     arguments = ["run", str(bare / "photos"), "-o", str(bare / "run"), "--workflow", recipe]
     code = invoke([*arguments, *(word for setting in settings for word in ("--set", setting))], installed())
-    lines = capsys.readouterr().err.strip().splitlines()
+    read, *lines = capsys.readouterr().err.strip().splitlines()
     assert code == 2
+    assert read.startswith("read: 3 photographs")
     assert len(lines) == 2 and cause in lines[0] and remedy in lines[1]
     assert not (bare / "run" / "ingest").exists()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 import time
@@ -21,7 +22,7 @@ from cleargs.own_files import append_own
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.progress import CountedTask, ForwardingTask, LineReporter, Reporter, Say, Task
-from cleargs.safe_io import open_regular, printable
+from cleargs.safe_io import open_own, printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -64,9 +65,14 @@ def check_log(path: Path, context: click.Context) -> None:
     run = next((place for place in given.values() if (place / RUN_FILE).is_file()), None)
     inputs = [given[name] for name in ("source", "sheet", "target", "directory", "renders") if name in given]
     check_outputs([path], context.obj, run, inputs=[place for place in inputs if place != run])
-    with suppress(OSError), open_regular(path) as file:  # there is none yet, or it is a device
+    root = path.parent if _in_run(path) else None
+    with suppress(OSError), os.fdopen(open_own(path, root), "rb") as file:  # none yet, a link or a device
         if (begin := file.read(30).lstrip()) and not re.match(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", begin):
             raise InputError(f"{path} exists, and is not a log of ClearGS", hint="choose another name")
+
+
+def _in_run(path: Path) -> bool:
+    return any((place / RUN_FILE).exists() for place in path.absolute().parents)
 
 
 class LineFile:
@@ -80,7 +86,7 @@ class LineFile:
         if self._needed.exists():
             text = "".join(f"{line}\n" for line in self._waiting)
             with disk_errors(self.path):
-                if any((place / RUN_FILE).exists() for place in self.path.absolute().parents):
+                if _in_run(self.path):
                     append_own(self.path, text)  # another may have sent the run: links are not followed
                 else:
                     with self.path.open("a", encoding="utf-8") as file:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from os.path import realpath
 from pathlib import Path
 
-from cleargs.digest import files_under
 from cleargs.errors import CleargsError, InputError
 from cleargs.packed import PACK
 from cleargs.pipeline.dag import Dag
@@ -107,7 +107,11 @@ class Place:
         """
         if any(way.is_relative_to(name) for way in self._names for name in _names(place)):
             return True
-        files = files_under(place).values() if self._file is not None and place.is_dir() else ()
+        # Nothing is looked up through a link in a run, which somebody may have sent.
+        linked = place.is_symlink() or place.parent.is_symlink()
+        walked = self._file is not None and not linked and place.is_dir()
+        found = os.walk(place) if walked else ()
+        files = (Path(folder, name) for folder, _, names in found for name in names)
         return _identity(place) in self._around or any(_identity(file) == self._file for file in files)
 
 

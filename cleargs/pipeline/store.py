@@ -409,9 +409,10 @@ def visible_names(folder: Path) -> list[str]:
 def copied_key(link: Path) -> str | None:
     """Return the key of the results that ``RUN/<stage>`` is a copy of; None if it is something else."""
     try:
-        return None if link.is_symlink() else (link / COPY).read_text("ascii").strip()
-    except (OSError, ValueError):
+        key = None if link.is_symlink() else read_bytes(link / COPY, 100, root=link.parent).decode().strip()
+    except (*FAULTS, ValueError):
         return None
+    return key if key and re.fullmatch(_KEY, key) else None
 
 
 def writer_is_alive(work: Path) -> bool:
