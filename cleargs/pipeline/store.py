@@ -410,7 +410,7 @@ def copied_key(link: Path) -> str | None:
     """Return the key of the results that ``RUN/<stage>`` is a copy of; None if it is something else."""
     try:
         key = None if link.is_symlink() else read_bytes(link / COPY, 100, root=link.parent).decode().strip()
-    except (*FAULTS, ValueError):
+    except FAULTS:
         return None
     return key if key and re.fullmatch(_KEY, key) else None
 
