@@ -317,7 +317,7 @@ def _regions(evaluation: Evaluation) -> str:
     if plain is not None and aligned is not None and aligned - plain > EXPOSURES_DIFFER:
         words.append(f"exposures differ: {aligned:.2f} dB with aligned colours (--align-colour)")
     if evaluation.psnr_as_filmed is not None:
-        words.append(f"{evaluation.psnr_as_filmed:.2f} dB as the rolling shutter saw the scene")
+        words.append(f"{evaluation.psnr_as_filmed:.2f} dB as the camera took the frames")
     if evaluation.covered is not None:
         words.append(f"{evaluation.covered:.1%} behind Gaussians in front of the true surface")
     return f"{_subject(evaluation)}: {'; '.join(words)}"

@@ -116,8 +116,8 @@ class ImageResult(Figures):
     )
     psnr_as_filmed: float | None = Field(
         None,
-        description="dB, of the scene as the rolling shutter saw it: the measured motion during the readout; "
-        "null where none was measured.",
+        description="dB, of the scene as its camera took the frame: with the measured motion during the "
+        "readout, and during the exposure time of the training's frames; null where none was measured.",
     )
 
 
@@ -229,7 +229,7 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             column("psnr_white", pa.float64(), "dB, of the scene over white", nullable=True),
             column("psnr_between", pa.float64(), "dB, between background and white", nullable=True),
             column("covered", pa.float64(), "share of the image that floaters cover", nullable=True),
-            column("psnr_as_filmed", pa.float64(), "dB, as the rolling shutter saw the scene", nullable=True),
+            column("psnr_as_filmed", pa.float64(), "dB, as the camera took the frame", nullable=True),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
             column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),

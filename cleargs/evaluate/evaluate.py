@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 
 import cv2
 import numpy as np
@@ -22,8 +23,9 @@ from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, me
 from cleargs.evaluate.references import Reference, ReferenceView, matching
 from cleargs.evaluate.refinement import refine_pose
 from cleargs.files import disk_errors
-from cleargs.formation.frame import read_out
+from cleargs.formation.frame import filmed_as
 from cleargs.formation.observed import FormedView
+from cleargs.formation.table import read_formation
 from cleargs.manifest import versions
 from cleargs.media.exr import read_depth
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
@@ -57,7 +59,7 @@ class _Prediction:
     covered: float | None = None
     """See `covered_share`; None if the true depth is not known."""
     as_filmed: ArrayF64 | None = None
-    """The render with the skew of the rolling shutter; None if no readout was measured."""
+    """The render with the measured motion during readout and exposure; None if none was measured."""
 
 
 Predict = Callable[[ReferenceView, ImageU8, MaskBool | None], _Prediction]
@@ -85,7 +87,7 @@ def evaluate_scene(
             f"{scene} is not a scene of Gaussians: {str(error).split(': ', 1)[-1]}", hint=READ
         ) from error
     set_threads(threads)
-    renderer = _renderer(loaded, options.refine_poses, reference.points)
+    renderer = _renderer(loaded, options.refine_poses, reference.points, exposure_of(scene.parent))
     name = subject or scene.name
     return _evaluate(name, file_digest(scene), renderer, reference, options, threads, reporter, save)
 
@@ -132,8 +134,19 @@ def evaluate_images(
     return found
 
 
-def _renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None) -> Predict:
-    """Return a function that renders a scene at references' views, with poses refined in ``refine_steps``."""
+def exposure_of(folder: Path) -> float:
+    """Return the median exposure time, s, that a training found with measured motions; 0 if it is unknown."""
+    table = folder / "formation.parquet"
+    frames = read_formation(table)[0] if table.is_file() else {}
+    times = [frame.motion.exposure_s for frame in frames.values() if frame.motion.exposure_s > 0.0]
+    return median(times) if times else 0.0
+
+
+def _renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None, exposure_s: float = 0.0) -> Predict:
+    """Return a function that renders a scene at references' views, with poses refined in ``refine_steps``.
+
+    ``exposure_s`` is the exposure time, s, for renders as the camera took the frames.
+    """
     engine = rasteriser_for(scene.gaussians.device)
 
     def render(camera: Camera) -> tuple[ArrayF64, ArrayF64]:
@@ -171,8 +184,8 @@ def _renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None) -> Predi
                 )
             covered = covered_share(scene, camera, surface / view.unit, mask)
         filmed = None
-        if view.readout is not None:
-            formed = FormedView(camera, 1.0, formation=read_out(view.readout))
+        if view.path is not None and (view.path.rolls or exposure_s > 0.0):
+            formed = FormedView(camera, 1.0, formation=filmed_as(view.path.exposed(exposure_s, camera)))
             seen = formed.forward(engine.view(scene, formed.camera, depth=True))
             filmed = seen.clamp(0.0, 1.0).numpy().astype(np.float64)
         return _Prediction(*render(camera), refinement, far, covered, filmed)

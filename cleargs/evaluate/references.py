@@ -26,8 +26,7 @@ from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
-from cleargs.formation.measured import load_paths
-from cleargs.formation.motion import FrameMotion
+from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
@@ -66,8 +65,8 @@ class ReferenceView:
     """EXR of the true depth, as `cleargs synth` writes it; None if it is not known."""
     unit: float = 1.0
     """Length of a unit of the scene, in the units of ``depth``."""
-    readout: FrameMotion | None = None
-    """Measured motion during the readout of a rolling shutter, px; None if none is known."""
+    path: MeasuredPath | None = None
+    """Measured motion of the camera; None if none is known."""
 
     @property
     def pose(self) -> Pose:
@@ -268,8 +267,7 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
             stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
         path = measured.get(frame.frame_id)
-        readout = path.read(view.camera) if path is not None and path.rolls else None
-        views.append(ReferenceView(stem, view.camera, view.load, readout=readout))
+        views.append(ReferenceView(stem, view.camera, view.load, path=path))
     return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
-from cleargs.formation.frame import FrameFormation, Shot, Terms, fit_motion, packed, read_out, unpacked
+from cleargs.formation.frame import FrameFormation, Shot, Terms, filmed_as, fit_motion, packed, unpacked
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import Movement
 from cleargs.formation.observed import FormedView
@@ -274,7 +274,7 @@ class CaptureFormation:
         path = self._measured.get(view.frame_id)
         if path is None or not path.rolls:
             return FrameFormation(view.frame_id)
-        return read_out(path.read(view.camera), view.frame_id)
+        return filmed_as(path.read(view.camera), view.frame_id)
 
     def _rolls(self, frame_id: int | None = None) -> bool:
         """Return True if frames, or this one, may have a skew that must be searched.

@@ -104,10 +104,12 @@ class FrameFormation:
         return explained_share(self.misfit, self.misfit_still)
 
 
-def read_out(skew: FrameMotion, frame_id: int = -1) -> FrameFormation:
-    """Return the formation of a frame with a skew alone."""
-    # No pixel moves farther than at the first and at the last row.
-    return FrameFormation(frame_id, skew, "skew", reach_px=0.5 * float(np.abs(skew.skew).sum()))
+def filmed_as(motion: FrameMotion, frame_id: int = -1) -> FrameFormation:
+    """Return the formation of a frame with a measured ``motion``."""
+    # No pixel moves farther than at the first and at the last row, and at the ends of the exposure.
+    reach = 0.5 * float(np.abs(motion.skew).sum() + np.abs(motion.blur).sum())
+    model = named("blur" if motion.blur.any() else "none", motion)
+    return FrameFormation(frame_id, motion, model, reach_px=reach)
 
 
 def described(frame: FrameFormation) -> str:

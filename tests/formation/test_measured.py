@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.frame import FrameFormation, read_out
+from cleargs.formation.frame import FrameFormation, filmed_as
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.observed import render_observed
@@ -82,7 +82,7 @@ def test_a_wrong_measurement_is_left_for_a_search(tmp_path: Path) -> None:
 def test_a_measured_skew_is_there_from_the_first_step(tmp_path: Path, columns: bool) -> None:
     path = measured(READOUT_S, columns=columns)
     skew = path.read(camera(0.0))
-    seen = filmed({k: read_out(skew, k) for k in range(FRAMES)})
+    seen = filmed({k: filmed_as(skew, k) for k in range(FRAMES)})
     formation = CaptureFormation(
         seen, FormationConfig(start=1.0), measured=dict.fromkeys(range(FRAMES), path)
     )
