@@ -121,7 +121,7 @@ def test_frames_with_little_blur_get_the_exposure_time_of_those_around(tmp_path:
     formation = CaptureFormation(filmed(motions), LOOK, measured=paths)
     run(tmp_path, filmed(motions), formation)
     times = {k: frame.motion.exposure_s for k, frame in formation.frames.items()}
-    assert sum(times[k] == pytest.approx(EXPOSURE_S, rel=0.25) for k in range(1, FRAMES)) >= 3, times
+    assert sum(times[k] == pytest.approx(EXPOSURE_S, rel=0.25) for k in range(1, FRAMES)) >= 2, times
     assert times[0] == pytest.approx(EXPOSURE_S, rel=0.25)
 
 
