@@ -107,7 +107,7 @@ class Place:
         """
         if any(way.is_relative_to(name) for way in self._names for name in _names(place)):
             return True
-        # Nothing is looked up through a link in a run, which somebody may have sent.
+        # Nothing is looked up through a link in a run, which may come from another user.
         linked = place.is_symlink() or place.parent.is_symlink()
         walked = self._file is not None and not linked and place.is_dir()
         found = os.walk(place) if walked else ()
