@@ -458,7 +458,9 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
     """Return the frame of a row from `as_row`. Older tables lack some columns."""
-    vector = np.array([row.get(f"{name}_{axis}") or 0.0 for name in TWISTS for axis in AXES])
+    twists = [row.get(f"{name}_{axis}") for name in TWISTS for axis in AXES]
+    # Not `or 0.0`, which would lose the sign of -0.0, and with it the bits of a resumed training.
+    vector = np.array([0.0 if value is None else value for value in twists])
     lens = {name: row[name] for name in LENS if row.get(name) is not None}
     return FrameFormation(
         row["frame_id"],

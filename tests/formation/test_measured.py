@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.frame import FrameFormation, filmed_as
+from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.observed import render_observed
@@ -142,3 +142,14 @@ def test_the_orders_of_an_exposure_follow_from_the_derivatives() -> None:
         )
         np.testing.assert_allclose(made, exact, atol=1e-9)
     assert isinstance(motion, FrameMotion) and motion.exposure_s == EXPOSURE_S
+
+
+def test_a_checkpoint_keeps_every_bit_of_a_formation() -> None:
+    """Also the sign of a zero: that of a readout of 0 s times a speed."""
+    vector = np.random.default_rng(1).normal(0, 1, 36)
+    vector[::5] = -0.0
+    motion = FrameMotion(exposure_s=EXPOSURE_S, columns=True, median_depth=DEPTH).with_vector(vector)
+    frame = FrameFormation(3, motion, "both", misfit=0.1, skew_gain=0.2, evidence=0.05, draws=7)
+    again = next(unpacked(packed([frame])))
+    assert packed([again]).tobytes() == packed([frame]).tobytes()
+    assert again.motion.vector.tobytes() == vector.tobytes()
