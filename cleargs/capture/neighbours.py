@@ -65,7 +65,13 @@ def neighbourhoods(capture: Capture) -> list[Neighbourhood]:
 
 
 def _in_folder(capture: Capture) -> list[Neighbourhood]:
-    """Return the neighbours by the numbers in the images' names, which must have a common step."""
+    """Return the neighbours by the numbers in the images' names, which must have a common step.
+
+    At least every second image must be left out. The motion between chosen frames, or between photographs,
+    says little about that during an exposure.
+    """
+    if 2 * len(capture.frames) > len(capture.available):
+        return []
     numbered: dict[tuple[str, int], SourceFrame] = {}
     for frame in capture.available:
         if (key := _number_of(frame.name)) is not None:

@@ -213,3 +213,9 @@ def test_repeated_frames_are_noticed() -> None:
     shown = [rng.integers(0, 255, (40, 60), np.uint8) for _ in range(5)]
     assert not repeats(shown)
     assert repeats([shown[0], shown[1], shown[1], shown[3], shown[4]])
+
+
+def test_a_folder_of_which_all_images_are_taken_has_no_neighbours() -> None:
+    """Photographs have numbers too. The motion between them is not that during their exposure."""
+    assert not neighbourhoods(numbered(*range(27), chosen=tuple(range(27))))
+    assert neighbourhoods(numbered(*range(54), chosen=tuple(range(0, 54, 2))))
