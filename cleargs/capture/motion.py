@@ -37,8 +37,8 @@ MIN_TRACKS = 20
 STEPS, LEAST_PX = 8, 0.05
 """Reweighted steps of a fit, and smallest scale of its weights, px."""
 SHARED_ERRORS = 250.0
-"""Factor of the covariance for the errors that tracks share, such as those of the sparse points' depths: about
-the median of chi squared per number in five tuning rooms, 200 to 960 (seed 31)."""
+"""Factor of the covariance for the errors that tracks share, such as those of the sparse points' depths. Chi
+squared per number was 200 to 960 (medians) in five tuning rooms without it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,7 @@ def filmed(folder: Path, protocol: str) -> Path:
     return room
 
 
-def ingested(room: Path, run: Path, *, threads: int = 2) -> dict[str, object]:
+def ingested(room: Path, run: Path, *, threads: int = 2) -> dict[str, Any]:
     arguments = ["--max-frames", "16", "--until", "ingest", "--no-report", "--threads", str(threads)]
     assert invoke(["run", str(room / "capture.mp4"), "-o", str(run), *arguments], installed()) == 0
     return dict(read_manifest(run / "ingest").summary)
@@ -36,7 +37,7 @@ def test_a_rolling_shutter_and_the_motion_of_a_room_are_measured(tmp_path: Path)
     assert row["left_by_neighbours"] < 0.35 < 0.6 < row["left_by_chosen_frames"]
     true_ms = 1000 * row["readout_true"] / 30
     assert summary["readout_ms"] == pytest.approx(true_ms, rel=0.1)
-    low, high = summary["readout_interval_ms"]  # type: ignore[misc]
+    low, high = summary["readout_interval_ms"]
     assert low < true_ms < high and summary["readout_along"] == "rows"
     other = ingested(room, tmp_path / "again", threads=1)
     assert json.dumps(other, sort_keys=True) == json.dumps(summary, sort_keys=True)
