@@ -164,9 +164,10 @@ def warp(size: tuple[int, int], backend: Backend, device: torch.device) -> Resul
     seen = _random(height + 2 * margin, width + 2 * margin, 5, device=device)
     image, depth = seen[..., :4].contiguous(), 2.0 + seen[..., 4]
     camera = [width, width, width / 2, height / 2, 2.5, 3.0, 1.4]  # fx fy cx cy, median depth, disc, focus
+    readout = [0.25, 1.0]  # across and down
     twists = [0, 1, 0, -2, 1, 0, 2, 1, -1, 4, 9, 2, 1, 0, 2, 3, 5, -2]  # pose, blur, skew
-    curves = [1, 0, 1, -6, 3, 2, 0, 2, 0, 20, 9, 1]  # bend, cube
-    motion = torch.tensor([*camera, *twists, *curves], dtype=torch.float32)
+    curves = [0, 1, 0, 2, -3, 1, 1, 0, 1, -6, 3, 2, 0, 2, 0, 20, 9, 1]  # skew's bend, bend, cube
+    motion = torch.tensor([*camera, *readout, *twists, *curves], dtype=torch.float32)
     fields = backend.displacements(depth, torch.ones_like(depth), motion, margin=margin)
     times = torch.linspace(-0.5, 0.5, 7)
     samples = torch.stack([times, times.flip(0), (3.0 * times).sin()], dim=1).to(device)
