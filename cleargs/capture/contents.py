@@ -17,6 +17,7 @@ from pathlib import Path
 from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import frame_key, image_files, is_wanted, mask_externals, masks_of, natural_key
+from cleargs.digest import files_under
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 from cleargs.media.headers import Header, lacks_package, read_header
@@ -165,14 +166,12 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
 
 def media_files(root: Path) -> list[Path]:
     """Return pictures and videos below ``root``, without hidden ones and those of runs."""
-    found = []
     suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
-    for folder, folders, names in os.walk(root, followlinks=True):
-        below = [name for name in sorted(folders) if not _SYSTEM.match(name)]
-        folders[:] = [name for name in below if not Path(folder, name, "run.toml").is_file()]
-        paths = [Path(folder, name) for name in sorted(names) if not name.startswith(".")]
-        found += [path for path in paths if path.suffix.lower() in suffixes and path.is_file()]
-    return found
+    found = files_under(
+        root, lambda folder: bool(_SYSTEM.match(folder.name)) or (folder / "run.toml").is_file()
+    )
+    files = (path for path in found.values() if path.suffix.lower() in suffixes and path.is_file())
+    return sorted(files, key=lambda path: (path.parent, path.name))
 
 
 def _without(files: Sequence[Path], others: Sequence[Path]) -> list[Path]:

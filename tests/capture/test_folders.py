@@ -183,6 +183,19 @@ def test_a_run_in_the_folder_is_no_photograph(images: Path, frames: Frames) -> N
     assert len(open_capture(images, IngestConfig()).frames) == 10
 
 
+@pytest.mark.parametrize(
+    "links",
+    [{"a": "."}, {"a": ".", "b": "."}, {"in/a": "..", "in/b": ".."}, {"masks/a": ".", "masks/b": ".."}],
+)
+def test_each_folder_is_entered_once(images: Path, links: dict[str, str]) -> None:
+    for name, target in links.items():
+        (images / name).parent.mkdir(exist_ok=True)
+        (images / name).symlink_to(target)
+    capture = open_capture(images, IngestConfig())
+    assert (capture.n_available, capture.told) == (10, "read: 10 photographs")
+    externals(images, IngestConfig())
+
+
 @pytest.mark.parametrize("name", [".thumbnails", "@eaDir", "__MACOSX", "#recycle"])
 def test_folders_of_systems_are_not_read(images: Path, name: str) -> None:
     shutil.copytree(images, images.parent / "copy")
