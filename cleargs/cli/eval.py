@@ -25,7 +25,7 @@ from cleargs.manifest import has_results
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE, check_links
-from cleargs.run_results import scene_path, scene_stage
+from cleargs.run_results import check_results, scene_path, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
@@ -249,6 +249,7 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
             f"{target} is not a run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
         )
     check_links(target)
+    check_results(dag, target)
     if "all" in stages:
         chosen = [
             name for name in dag.names if has_results(target, name) and scene_path(target, name).is_file()
