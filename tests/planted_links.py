@@ -44,7 +44,7 @@ TOY_COMMANDS: Commands = (
 )
 
 SCENE_COMMANDS: Commands = (
-    ("show", "RUN", "--frame", "2", "-o", "OUT/frame.png"),
+    ("show", "RUN", "--frame", "2", "-o", "OUT/frame.png", "--force"),
     ("export", "RUN", "-o", "OUT/a.ply", "--prune", "contribution:0.1", "--cameras", "--force"),
     ("render", "RUN", "-o", "OUT/a.png", "--frame", "2", "--side-by-side", "--force"),
     ("eval", "RUN", "--lpips", "none", "--scorers", "none", "--stage", "all"),
