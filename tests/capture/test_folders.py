@@ -260,6 +260,17 @@ def test_other_files_and_folders_stand_for_themselves(tmp_path: Path, images: Pa
     assert whole_capture(tmp_path / "nothing") == tmp_path / "nothing"
 
 
+def test_a_capture_whose_name_is_a_number(tmp_path: Path, images: Path) -> None:
+    """COLMAP's automatic reconstructor writes the undistorted images and their model into dense/0."""
+    whole = tmp_path / "dense" / "0"
+    shutil.copytree(images, whole / "images")
+    (whole / "sparse").mkdir()
+    (whole / "sparse/cameras.bin").touch()
+    assert whole_capture(whole / "sparse") == whole_capture(whole / "sparse/cameras.bin") == whole
+    shutil.copytree(images, tmp_path / "images")
+    assert any(f"give {whole} as" in note for note in open_capture(tmp_path, IngestConfig()).notes)
+
+
 def test_videos_next_to_few_photographs_are_the_capture(tmp_path: Path, frames: Frames) -> None:
     write(apps.stray, tmp_path / "a", frames)
     (tmp_path / "a/rgb.mp4").rename(tmp_path / "walk.mp4")
