@@ -28,5 +28,11 @@ def test_links_at_the_first_paths_of_a_finished_run_lead_nowhere(
 
 def test_links_in_a_packed_run_are_not_read(tmp_path: Path) -> None:
     planter = packed_run(tmp_path)
-    for name in ("pack.json", "scene.ply", "report/frames/000000-final.jpg", "report/scene.js"):
+    for name in (
+        "pack.json",
+        "scene.ply",
+        "report/frames/000000-final.jpg",
+        "report/scene.js",
+        "run-report.html",
+    ):
         assert planter.check(Path(name), "link")

@@ -72,7 +72,7 @@ def report(
         if target.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"{target} does not end in .html", hint="name the file NAME.html")
         check_outputs([target], dag, run)
-        if target.exists() and not is_own_page(target):
+        if target.exists() and not target.is_symlink() and not is_own_page(target):  # a link is replaced
             raise InputError(f"{target} exists and is not a report of ClearGS", hint="choose another name")
     from cleargs.report.page import write_report
     from cleargs.report.single_file import write_single_file
