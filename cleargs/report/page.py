@@ -37,7 +37,7 @@ from cleargs.report.frames import (
     scores_of,
     worst_cue,
 )
-from cleargs.report.outcome import outcome
+from cleargs.report.outcome import LOOSE_DB, outcome
 from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
 from cleargs.report.report_json import (
     ENTRY,
@@ -147,6 +147,7 @@ def write_report(planner: Planner) -> Path:
                 "layers": LAYERS,
                 "meanings": MEANINGS,
                 "opening": {"left": "observed", "right": "final"},
+                "poor": LOOSE_DB,
                 "start": opening_frame(placed).frame.frame_id if scene else None,
                 "frames": frames,
                 "viewer": settings,

@@ -24,6 +24,7 @@ from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.report.advice import Advice, shown_advice
 from cleargs.report.frames import FrameRow, load_rows
+from cleargs.report.outcome import outcome
 from cleargs.report.report_json import linked_manifests
 
 SIZE = 64
@@ -119,3 +120,14 @@ def test_printed_commands_run_as_printed(
         assert program == "cleargs" and invoke([*words, "--dry-run"], finished.dag) == 0, (
             capsys.readouterr().err
         )
+
+
+def test_the_verdict_names_the_capture_and_a_short_training() -> None:
+    def headline(steps: int, time_s: float | None) -> str:
+        facts = {"registered": True, "split": "train", "time_s": time_s}
+        rows = [FrameRow(SimpleNamespace(**facts), {"role": "strong", "weight": 1.0})] * 40  # type: ignore[arg-type]
+        g0 = SimpleNamespace(summary={"psnr_unseen": 32.4, "steps": steps})
+        return outcome({"g0": g0}, rows, []).headline  # type: ignore[dict-item]
+
+    assert headline(40, None) == "Good: the scene matches the photographs closely after a short training."
+    assert headline(10_000, 0.1) == "Good: the scene matches the video closely."
