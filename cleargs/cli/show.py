@@ -118,7 +118,7 @@ def show(
         if as_json:
             print_json({name: manifest_json(done[name]) if name in done else None for name in dag.names})
         else:
-            _print_run(settings, {name: done.get(name) for name in dag.names})
+            _print_run(settings, {name: done.get(name) for name in settings.stages(dag)})
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     else:
@@ -143,8 +143,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
     elif None in manifests.values():
         click.echo(as_called(f"not done: see cleargs status {quote(str(run.folder))}"))
     if work := running_stage(run.folder, run.store):
-        count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
-        click.echo(f"\n{work.stage} is running: {', '.join(filter(None, (work.label, count, work.note)))}")
+        click.echo(f"\n{work.stage} is running: {work.words}")
         if preview := preview_of(work, run.store):
             click.echo(f"preview: {preview.path}")
 

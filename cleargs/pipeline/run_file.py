@@ -59,6 +59,11 @@ class RunSpec:
     falls_back: bool = field(default=False, compare=False)
     """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
 
+    def stages(self, dag: Dag) -> tuple[str, ...]:
+        """Return the stages that have work with the settings of the run: a draft has no repairs."""
+        idle = {name: getattr(dag.load(name), "idle", None) for name in dag.names}
+        return tuple(name for name, check in idle.items() if not (check and check(self.config.effective)))
+
     def device_of(self, stage: str) -> Device:
         return "cpu" if stage in self.on_cpu else self.device
 

@@ -66,7 +66,9 @@ def shown_advice(
     if not any(advice.options and advice.worth for advice in found):
         found = [advice for advice in found if advice.worth]
     return [
-        advice._replace(command=_command(planner.run, advice.options), time=_time(planner, advice.options))
+        advice._replace(
+            command=_command(planner.run, advice.options), time=_time(planner, advice.options, manifests)
+        )
         if advice.options
         else advice
         for advice in found
@@ -115,8 +117,8 @@ def toml_text(value: Any) -> str:
     return " ".join(tomli_w.dumps({"v": value}).removeprefix("v = ").split())
 
 
-def _time(planner: Planner, options: Sequence[str]) -> str:
-    """Return the expected time of the run with ``options``; "" if it is unknown."""
+def _time(planner: Planner, options: Sequence[str], manifests: Mapping[str, Manifest]) -> str:
+    """Return the expected time of the run with ``options``, by that of the run; "" if it is unknown."""
     given = [
         f"g0.quality={value}" if option == "--quality" else value
         for option, value in pairwise(options)
@@ -127,9 +129,10 @@ def _time(planner: Planner, options: Sequence[str]) -> str:
         run = replace(planner.run, config=load_config(planner.dag, kept, given))
         changed = Planner(planner.dag, run, planner.store, planner.threads, SilentReporter())
         costs = [plan.estimate.minutes for plan in changed.plan() if plan.estimate is not None]
+        minutes = sum(costs) * planner.pace_of(manifests)
     except CleargsError:  # the capture was deleted or moved
         return ""
-    return f"about {max(1, round(sum(costs)))} min" if costs else ""
+    return f"about {max(1, round(minutes))} min" if costs else ""
 
 
 def _on_frames(

@@ -134,7 +134,7 @@ def write_report(planner: Planner) -> Path:
             viewer=viewer,
             licence=(folder / LICENCE).read_text(encoding="utf-8") if viewer else "",
             size=single_file_size(folder),
-            stages=planner.dag.names,
+            stages=planner.run.stages(planner.dag),
             manifests=manifests,
             cameras=cameras_of(manifests),
             plans=plans,
