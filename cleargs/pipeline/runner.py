@@ -143,10 +143,9 @@ class Runner(Planner):
         programs took the processor.
         """
         last = list(made.values())[-1]
-        wall, own = last.seconds + last.compile_seconds, last.cpu_seconds
-        busy = (
-            wall > BUSY * own and wall > STEADY_S
-        )  # one idle core gives as much processor time as the clock
+        wall, own = last.seconds + last.compile_seconds, last.cpu_seconds or 0.0
+        # Alone, a stage gets at least the time of one core.
+        busy = wall > BUSY * own and wall > STEADY_S
         pace = self.pace_of(made) if busy or len(made) > 1 else 1.0
         costs = [
             replace(plan, estimate=self.estimate(plan.stage, done).at_pace(pace))
