@@ -25,6 +25,7 @@ Examples:
   cleargs export room -o room.ply --metres 0-40=3.5   frames 0 and 40 were filmed 3.5 m apart
   cleargs export room -o room.ply --world input    in the world of the capture's poses
   cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
+  cleargs export room -o room.ply --drop sphere:0.2,-1,3,0.1   without a floater
   cleargs export other.spz -o other.ply            a scene file of any program
   cleargs export room --capture room-data          frames and poses for nerfstudio, gsplat, Brush
 
@@ -73,8 +74,14 @@ Programs of --for:
 @click.option(
     "--crop",
     metavar="box:X,Y,Z,X,Y,Z|percentile:P",
-    help="Keep the Gaussians in a box. Give two corners in the coordinates of cameras.json, or P for the "
-    "middle P percent along each axis.",
+    help="Keep the Gaussians in a box. Give two corners in the coordinates of the file, which the report's "
+    "3D view shows, or P for the middle P percent along each axis.",
+)
+@click.option(
+    "--drop",
+    multiple=True,
+    metavar="sphere:X,Y,Z,R",
+    help="Leave out the Gaussians in a sphere, such as a floater. May be given several times.",
 )
 @click.option(
     "--spz",

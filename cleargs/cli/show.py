@@ -75,6 +75,7 @@ Examples:
   cleargs show room                 all stages: state, time, size, figures
   cleargs show room rva             role and weight of each frame, and why
   cleargs show room rva --columns   the columns of the tables, with their meanings
+  cleargs show room scene           the box that holds the scene, for export --crop
   cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
 )
@@ -119,6 +120,8 @@ def show(
             print_json({name: manifest_json(done[name]) if name in done else None for name in dag.names})
         else:
             _print_run(settings, {name: done.get(name) for name in settings.stages(dag)})
+    elif stage == "scene":
+        _show_extent(dag, run, as_json)
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     else:
@@ -146,6 +149,19 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
         click.echo(f"\n{work.stage} is running: {work.words}")
         if preview := preview_of(work, run.store):
             click.echo(f"preview: {preview.path}")
+
+
+def _show_extent(dag: Dag, run: Path, as_json: bool) -> None:
+    """Print the scene's box, in the coordinates of the exports that turn nothing."""
+    from cleargs.render.pruning import extent_text
+    from cleargs.run_results import scene_path, scene_stage
+    from cleargs.splat.ply import read_ply
+
+    stage = scene_stage(dag, run, None)
+    scene = read_ply(scene_path(run, stage))
+    low, high = scene.gaussians.means.amin(0).tolist(), scene.gaussians.means.amax(0).tolist()
+    facts = {"stage": stage, "gaussians": scene.gaussians.num, "low": low, "high": high}
+    answer(as_json, facts, f"scene of {stage}: {scene.gaussians.num} Gaussians", extent_text(scene))
 
 
 def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bool, as_json: bool) -> None:

@@ -22,7 +22,7 @@ from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
-from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
+from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.run_results import scene_path
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
@@ -45,6 +45,7 @@ class ExportOptions:
     sh_degree: int | None = None
     prune: Sequence[str] = ()
     crop: str | None = None
+    drop: Sequence[str] = ()
     cameras: bool = False
     """Write cameras and COLMAP model too."""
     force: bool = False
@@ -122,12 +123,16 @@ def _kinds(outputs: Sequence[Path], options: ExportOptions) -> list[str]:
     for kind in kinds:
         check_up(kind, options.up)
     parse_crop(options.crop)
+    parse_drop(options.drop)
     return kinds
 
 
 def _cropped(scene: Scene, options: ExportOptions) -> tuple[Scene, list[str]]:
-    """Return the scene in the box of the options, and messages. Raises InputError if nothing is left."""
-    messages = []
+    """Return the scene in the box of the options, and messages. Raises InputError if nothing is left.
+
+    Boxes and spheres are in the coordinates of the file.
+    """
+    scene, messages = drop_spheres(scene, parse_drop(options.drop))
     if (region := parse_crop(options.crop)) is not None:
         scene, message = crop_scene(scene, region)
         messages.append(message)

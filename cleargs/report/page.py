@@ -148,6 +148,8 @@ def write_report(planner: Planner) -> Path:
                 "meanings": MEANINGS,
                 "opening": {"left": "observed", "right": "final"},
                 "poor": LOOSE_DB,
+                "program": f"{program(run.parent)} ",
+                "shellName": quote(run.name),
                 "start": opening_frame(placed).frame.frame_id if scene else None,
                 "frames": frames,
                 "viewer": settings,

@@ -180,6 +180,23 @@ def test_a_frame_without_a_pixel_that_counts_is_not_in_the_psnr_of_pruning(
     assert numbers(capsys, PRUNED)[1:] == [30.0, 20.0]
 
 
+def test_a_sphere_is_dropped_and_the_box_of_the_scene_shown(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    means = read_ply(run.folder / "consolidate/scene.ply").gaussians.means
+    centre = ",".join(f"{x:.6f}" for x in means[7].tolist())
+    assert export(run, tmp_path / "d.ply", "--drop", f"sphere:{centre},0.01") == 0
+    (gone,) = numbers(capsys, r"dropped (\d+) Gaussians")
+    left = read_ply(tmp_path / "d.ply").gaussians.means
+    assert len(left) == len(means) - int(gone) and (left - means[7]).norm(dim=1).min() > 0.01
+    assert invoke(["show", str(run.folder), "scene", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["low"] == means.amin(0).tolist() and facts["high"] == means.amax(0).tolist()
+    assert export(run, tmp_path / "e.ply", "--crop", "box:50,50,50,51,51,51") == 2
+    box = ",".join(f"{x:.4g}" for x in facts["low"] + facts["high"])
+    assert f"the scene is in box:{box}, its 1 to 99 % in box:" in capsys.readouterr().err
+
+
 def test_a_crop_uses_the_coordinates_of_the_cameras(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,6 +237,8 @@ def test_up(run: FinishedRun, kind: str, tmp_path: Path) -> None:
         ("a.ply", ("--crop", "box:1,1,1,0,0,0"), "--crop box"),
         ("a.ply", ("--crop", "percentile:101"), "--crop percentile"),
         ("a.ply", ("--crop", "box:50,50,50,51,51,51"), "no Gaussian is left"),
+        ("a.ply", ("--drop", "sphere:0,0,0"), "--drop sphere"),
+        ("a.ply", ("--drop", "sphere:50,50,50,1"), "no Gaussian is in the sphere"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(

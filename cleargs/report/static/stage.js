@@ -7,6 +7,7 @@
   const pane = one('[data-pane="scene"]');
   const { settings, antialias, step, rotations } = report.viewer;
   let viewer = null;
+  let sceneUrl = "";
   let wanted = report.frames[timeline.index()].time ?? 0;
 
   const loadScript = (name) => new Promise((resolve, reject) => {
@@ -27,7 +28,7 @@
 
   const open = async () => {
     const module = await import(await unpack("viewer", "text/javascript"));
-    const url = await unpack("scene", "application/octet-stream");
+    const url = sceneUrl = await unpack("scene", "application/octet-stream");
     const save = one("#save");
     save.hidden = false;
     save.addEventListener("click", () => Object.assign(make("a"), { href: url, download: save.dataset.name }).click());
@@ -139,12 +140,12 @@
     full: () => (document.fullscreenElement ? document.exitFullscreen() : stage.requestFullscreen()),
   };
   for (const button of all("#controls [data-act]")) {
-    button.addEventListener("click", () => { if (viewer) act[button.dataset.act](); });
+    button.addEventListener("click", () => { if (viewer) act[button.dataset.act]?.(); });
   }
   one("#stand").addEventListener("click", () => {
     inspector.close();
     timeline.select(current);
     stage.scrollIntoView({ block: "center" });
   });
-  window.reportStage = { goTo, get viewer() { return viewer; } };
+  window.reportStage = { goTo, get viewer() { return viewer; }, get sceneUrl() { return sceneUrl; } };
 }
