@@ -201,9 +201,9 @@ class Prepared:
             run = cg.open_run("run")
             cg.open_prepared(run["ingest"]).to_nerfstudio("for-gsplat", run["rva"].weights())
         """
-        from cleargs.render.handover import write_handover
+        from cleargs.handover import write_handover
 
-        return write_handover(self, Path(folder), weights)
+        return write_handover(self.folder, self.frames, self.points, self.cameras(), Path(folder), weights)
 
     def views(self, weights: Mapping[int, float] | None = None) -> list[TrainingView]:
         """Return the views of a training: the frames with a pose that are not held out.

@@ -19,8 +19,8 @@ from plyfile import PlyData
 
 import cleargs as cg
 from cleargs.errors import CleargsError
+from cleargs.handover import gsplat_order
 from cleargs.progress import SilentReporter
-from cleargs.render.handover import gsplat_order
 from cleargs.synth.synthetic_capture import make_capture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

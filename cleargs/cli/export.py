@@ -150,7 +150,7 @@ def export(
             options[name] = getattr(target, name) if options[name] is None else options[name]
     if not outputs:
         raise InputError("no file is given", hint="give -o FILE, or --for PROGRAM")
-    given = ExportOptions(**{**options, "spz": options["spz"] or 3})
+    given = ExportOptions(**{**options, "spz": options["spz"] or 3}, views=program == "web")
     stage = None if run.is_file() and chosen is None else scene_stage(dag, run, chosen)
     if stage is None:
         lines = export_file(run, outputs, given)
@@ -163,7 +163,7 @@ def export(
 
 def _export_capture(run: Path, folder: Path, as_json: bool) -> None:
     """Write the frames of ``run`` for other trainers."""
-    from cleargs.render.handover import SPLIT
+    from cleargs.handover import SPLIT
     from cleargs.run_results import open_prepared, open_run
     from cleargs.safe_io import read_json
 

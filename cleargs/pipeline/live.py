@@ -73,7 +73,10 @@ def stage_at_work(run: Path, store: Path, *, stopped: bool = False) -> tuple[str
     With ``stopped``, the caller is the process that worked, and stops.
     """
     found = _last_stage(run)
-    if found is None or not (work := store / "work" / found.work).is_dir():
+    if found is None:
+        return None
+    work = store / "work" / found.work
+    if work.parent.is_symlink() or work.is_symlink() or not work.is_dir():
         return None
     if not stopped and writer_is_alive(work):
         return found.stage, f"running: {found.words}, for {max(0.0, time.time() - found.begun):.0f} s"

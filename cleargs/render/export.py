@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Similarity
 from cleargs.capture.model import read_model, transform_model, write_model
@@ -19,6 +20,7 @@ from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_bytes, write_json
 from cleargs.formation.frames import view_of
 from cleargs.manifest import linked_manifest
+from cleargs.named_views import NamedView, read_views
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
@@ -52,6 +54,8 @@ class ExportOptions:
     """Replace existing files."""
     spz: SpzVersion = 3
     """Version of .spz files."""
+    views: bool = False
+    """Write the named views of the run, if it has some, next to the first file."""
 
 
 def export_scene(
@@ -90,6 +94,11 @@ def export_scene(
     scene, cropped = _cropped(scene, options)
     for output in outputs if options.cameras else ():
         _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
+    if options.views and (views := read_views(run)):
+        file = outputs[0].with_name(f"{_stem(outputs[0])}.views.json")
+        check_outputs([file], installed(), run, force=options.force)
+        write_json(file, views_json(views, next(iter(cameras.values()))[1], **similarity))
+        messages.append(f"{file}: {len(views)} views")
     axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
     written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {stage}, {axes}")
     return [*messages, *cropped, *written]
@@ -188,6 +197,32 @@ def _similarity(
         factor = wanted / (apart * similarity["scale"])
         similarity |= {name: factor * similarity[name] for name in ("scale", "translation")}
     return similarity
+
+
+def views_json(
+    views: Sequence[NamedView],
+    camera: Camera,
+    scale: float = 1.0,
+    rotation: NDArray[np.float64] | None = None,
+    translation: NDArray[np.float64] | None = None,
+) -> list[dict[str, Any]]:
+    """Return name, position, target, up and horizontal field of view (degrees, of ``camera``) of each view.
+
+    They are in the world of the file: x -> scale rotation x + translation.
+    """
+    turn = np.eye(3) if rotation is None else rotation
+    shift = np.zeros(3) if translation is None else translation
+    fov = float(np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx)))
+    return [
+        {
+            "name": view.name,
+            "position": (scale * turn @ view.position + shift).tolist(),
+            "target": (scale * turn @ view.target + shift).tolist(),
+            "up": (turn @ [0.0, -1.0, 0.0]).tolist(),
+            "fov": fov,
+        }
+        for view in views
+    ]
 
 
 def _write_sidecars(

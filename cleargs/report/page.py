@@ -19,6 +19,7 @@ import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder, write_bytes
 from cleargs.manifest import plain_json
+from cleargs.named_views import read_views
 from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.plan import Planner, StagePlan
@@ -116,7 +117,7 @@ def write_report(planner: Planner) -> Path:
             viewer = write_viewer(folder)
         models = scene_with_models(rows, run, manifests)
         pictures = write_pictures(rows, run, folder, final, models, planner.threads)
-        settings, times = viewer_data(placed, scene) if scene else (None, {})
+        settings, times = viewer_data(placed, scene, read_views(run)) if scene else (None, {})
         frames = [
             frame_data(row, pictures[number], times.get(number))
             for number, row in zip(pictures, rows, strict=True)
@@ -130,6 +131,7 @@ def write_report(planner: Planner) -> Path:
             outcome=outcome(manifests, rows, unseen),
             advice=shown_advice(planner, manifests, rows),
             scene=scene,
+            views=settings["views"] if settings else [],
             films=sorted(file.name for file in run.glob("*.mp4")),
             viewer=viewer,
             licence=(folder / LICENCE).read_text(encoding="utf-8") if viewer else "",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from report_run import COUNT, HOSTILE, FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.digest import DigestMemo
+from cleargs.named_views import keep_views
 from cleargs.pipeline.store import Store
 from cleargs.report.frames import camera_of
 from cleargs.report.page import write_report
@@ -182,6 +185,29 @@ def test_two_clicks_measure_and_give_the_scale(wide: Report, run: FinishedRun) -
     if folder := os.environ.get("CLEARGS_SHOTS"):
         page.screenshot(path=f"{folder}/measure.png")
     page.locator('[data-act="measure"]').click()
+
+
+def test_a_kept_view_comes_back_in_the_single_file(wide: Report, browser: Any, tmp_path: Path) -> None:
+    wide.page.locator('[data-act="keep"]').click()
+    said = wide.page.locator("#measure code").inner_text()
+    name, _, numbers = shlex.split(said)[-1].partition("=")
+    there = wide.camera()
+    values = np.array([float(x) for x in numbers.split(",")])
+    assert name == "start" and np.allclose(values[:3], there[:3] * [-1, -1, 1], atol=1e-4)
+    other = FinishedRun(tmp_path / "other")
+    moved = values + np.array([0.1, 0, 0.1] * 2)
+    keep_views(other.folder, ["start=" + ",".join(map(str, moved)), "Desk=0,0,-1,0,0,1"])
+    (other.folder / ".store").mkdir()
+    with DigestMemo(other.folder / ".store/digests.json") as memo:
+        page = write_report(other.planner(Store(other.folder / ".store", memo)))
+    write_single_file(page, tmp_path / "alone.html")
+    with closing(browser.new_page(viewport={"width": 640, "height": 500}, device_scale_factor=0.5)) as tab:
+        opened = Report(tab, (tmp_path / "alone.html").as_uri())
+        opened.scene()
+        assert np.allclose(opened.camera()[:3], moved[:3] * [-1, -1, 1], atol=1e-3)
+        tab.get_by_role("button", name="Desk").click()
+        opened.settle()
+        assert np.allclose(opened.camera(), [0, 0, -1, 0, 0, 1], atol=1e-3)
 
 
 def test_a_scene_with_roll_is_shown_as_filmed(wide: Report) -> None:

@@ -15,9 +15,14 @@ from colmap_model import POINTS_XYZ, write_no_formation, write_sparse
 from report_run import FinishedRun
 
 from cleargs.capture.model import read_model
+from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
+from cleargs.errors import InputError
 from cleargs.formation.observed import Fit
+from cleargs.named_views import keep_views
 from cleargs.render import pruning
+from cleargs.report.frames import camera_of
+from cleargs.splat.camera import Camera
 from cleargs.splat.formats import FORMATS
 from cleargs.splat.ply import read_ply
 
@@ -252,3 +257,28 @@ def test_what_cannot_be_meant_is_refused(
     assert export(run, tmp_path / name, *options) == 2 and not list(tmp_path.iterdir())
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("error", "hint"))]
     assert len(said) == 2 and cause in said[0]
+
+
+def test_named_views_go_to_web_pages(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(run, tmp_path / "none.spz", "--for", "web") == 0
+    assert not (tmp_path / "none.views.json").exists()
+    keep_views(run.folder, ["start=0,0,-1,0,0,1", "gone=0,0,0,1,1,1", "gone="])
+    try:
+        assert export(run, tmp_path / "a.spz", "--for", "web", "--cameras") == 0
+    finally:
+        (run.folder / "views.json").unlink()
+    (view,) = json.loads((tmp_path / "a.views.json").read_text())
+    first = json.loads((tmp_path / "a.cameras.json").read_text())[0]
+    turn = np.array(first["rotation"]) @ camera_of_first(run).world_to_camera[:3, :3]
+    assert view["name"] == "start"
+    assert np.allclose(np.subtract(view["target"], view["position"]), turn @ [0, 0, 2], atol=1e-6)
+    assert np.allclose(view["up"], turn @ [0, -1, 0], atol=1e-6)
+    for wrong in ("x", "x=1,2,3", "=0,0,0,1,1,1", "x=0,0,0,0,0,0"):
+        with pytest.raises(InputError, match="--view"):
+            keep_views(run.folder, [wrong])
+
+
+def camera_of_first(run: FinishedRun) -> Camera:
+    return camera_of(next(frame for frame in load_frames(run.folder / "ingest") if frame.registered))

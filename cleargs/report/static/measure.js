@@ -91,9 +91,9 @@
   };
 
   // -- the text below the view ------------------------------------------------------------------------------
-  const command = (options) => {
+  const command = (options, verb = "export") => {
     const line = make("div", undefined, "command");
-    const words = `${report.program}export ${report.shellName} ${options}`;
+    const words = `${report.program}${verb} ${report.shellName} ${options}`;
     const copies = Object.assign(make("button", "Copy", "copy"), { type: "button" });
     copies.addEventListener("click", async () => { await copy(words); copies.textContent = "Copied"; });
     line.append(make("code", words), copies);
@@ -160,6 +160,25 @@
     panel.hidden = !measures;
     points = [];
     show();
+  });
+
+  // The present view as an option of `cleargs report`: a page cannot store it.
+  one('[data-act="keep"]').addEventListener("click", () => {
+    if (!window.reportStage.viewer) return;
+    const node = camera();
+    const position = turned(node.getPosition());
+    const target = position.map((value, k) => value + turned(node.forward)[k]);
+    const label = make("label", "Name of the view (start: the first one): ");
+    const input = label.appendChild(Object.assign(make("input"), { value: "start", id: "view-name" }));
+    const made = make("div");
+    const write = () => {
+      const name = input.value.replaceAll("=", "").replaceAll("'", "’").trim() || "start";
+      made.replaceChildren(command(`--view '${name}=${[...position, ...target].map((x) => x.toFixed(5)).join(",")}'`, "report"));
+    };
+    input.addEventListener("input", write);
+    write();
+    panel.hidden = false;
+    panel.replaceChildren(label, made, make("p", "This command stores the view in the run, and writes the report again.", "soft"));
   });
 
   let pressed = null;

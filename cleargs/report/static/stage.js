@@ -5,7 +5,7 @@
   const stage = one("#stage");
   const status = one("#status");
   const pane = one('[data-pane="scene"]');
-  const { settings, antialias, step, rotations } = report.viewer;
+  const { settings, antialias, step, rotations, views } = report.viewer;
   let viewer = null;
   let sceneUrl = "";
   let wanted = report.frames[timeline.index()].time ?? 0;
@@ -64,7 +64,9 @@
     try {
       viewer = await open();
       tilt();
-      goTo(wanted);
+      const start = views.find(({ name }) => name === "start");
+      if (start) showView(start.time);
+      else goTo(wanted);
       viewer.app.once("frameend", () => pane.classList.add("ready"));
       status.textContent = "";
     } catch (error) {
@@ -117,6 +119,12 @@
   };
 
   const goTo = (time) => { stop(); seek(time); };
+
+  // A view of the user is a key of the track behind those of the frames.
+  const showView = (time) => { goTo(time); stage.dataset.away = ""; };
+  for (const button of all("[data-view]")) {
+    button.addEventListener("click", () => { if (viewer) showView(Number(button.dataset.view)); });
+  }
 
   const placed = report.frames.filter((frame) => frame.time !== null);
   const fly = () => {

@@ -11,35 +11,38 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from cleargs.capture.model import read_model, write_model
-from cleargs.capture.tables import Frame
+from cleargs.capture.tables import Frame, Points
 from cleargs.files import whole_folder, write_bytes, write_json
 from cleargs.media.image import write_mask
 from cleargs.packed import require_images
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
-
-if TYPE_CHECKING:
-    from cleargs.capture.tables import Points
-    from cleargs.run_results import Prepared
+from cleargs.splat.camera import Camera
 
 SPLIT, POINTS = "split.json", "points.ply"
 
 
-def write_handover(capture: Prepared, target: Path, weights: Mapping[int, float] | None) -> Path:
-    """Write ``capture`` into the new folder ``target`` (`cleargs.run_results.Prepared.to_nerfstudio`)."""
-    run = capture.folder.parent
+def write_handover(
+    ingest: Path,
+    frames: Sequence[Frame],
+    points: Points,
+    cameras: Mapping[int, Camera],
+    target: Path,
+    weights: Mapping[int, float] | None,
+) -> Path:
+    """Write a capture into the new folder ``target`` (`cleargs.run_results.Prepared.to_nerfstudio`)."""
+    run = ingest.parent
     require_images(run, "writing them")
     check_outputs([target], installed(), run)
-    cameras = capture.cameras()
-    known = {frame.frame_id: 1.0 for frame in capture.frames} if weights is None else weights
+    known = {frame.frame_id: 1.0 for frame in frames} if weights is None else weights
     used = [
         frame
-        for frame in capture.frames
+        for frame in frames
         if frame.registered and (frame.split == "test" or known.get(frame.frame_id, 0.0) > 0)
     ]
     every, order, extra = gsplat_order(used)
@@ -54,22 +57,22 @@ def write_handover(capture: Prepared, target: Path, weights: Mapping[int, float]
             (made / "masks").mkdir()
         for frame in used:
             camera, name = cameras[frame.frame_id], names[frame.frame_id]
-            shutil.copyfile(capture.folder / frame.image, made / "images" / name)
+            shutil.copyfile(ingest / frame.image, made / "images" / name)
             pose = np.linalg.inv(camera.world_to_camera) * [1.0, -1.0, -1.0, 1.0]  # OpenGL axes
             entry: dict[str, Any] = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
             entry |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
             entry |= {"w": camera.width, "h": camera.height}
             if masked:  # nerfstudio wants one for each image, or none
                 entry["mask_path"] = f"masks/{Path(name).stem}.png"
-                _write_mask(capture.folder, frame, made / entry["mask_path"])
+                _write_mask(ingest, frame, made / entry["mask_path"])
             entries.append(entry)
         files = {frame.frame_id: f"images/{names[frame.frame_id]}" for frame in used}
         train, test = ([files[f.frame_id] for f in used if f.split == kind] for kind in ("train", "test"))
         split = {"train_filenames": train, "val_filenames": test, "test_filenames": test} if test else {}
         document = {"camera_model": "PINHOLE", "ply_file_path": POINTS, **split, "frames": entries}
         write_json(made / "transforms.json", document)
-        write_points(made / POINTS, capture.points)
-        _write_model(capture, made / "sparse/0", names, {frame.frame_id for frame in extra})
+        write_points(made / POINTS, points)
+        _write_model(ingest, points, made / "sparse/0", names, {frame.frame_id for frame in extra})
         facts = {
             "train": train,
             "test": test,
@@ -114,15 +117,17 @@ def _write_mask(folder: Path, frame: Frame, target: Path) -> None:
         write_mask(target, np.full((frame.height, frame.width), 255, np.uint8))
 
 
-def _write_model(capture: Prepared, folder: Path, names: Mapping[int, str], without: set[int]) -> None:
+def _write_model(
+    ingest: Path, points: Points, folder: Path, names: Mapping[int, str], without: set[int]
+) -> None:
     """Write the COLMAP model of ingest with the new names of its images, which have frame_id + 1 as id."""
-    model = read_model(capture.folder / "colmap/sparse/0")
+    model = read_model(ingest / "colmap/sparse/0")
     images = {
         key: replace(image, name=names[key - 1])
         for key, image in model.images.items()
         if key - 1 in names and key - 1 not in without
     }
-    write_model(folder, replace(model, images=images), capture.points.rgb)
+    write_model(folder, replace(model, images=images), points.rgb)
 
 
 def write_points(path: Path, points: Points) -> None:
