@@ -143,7 +143,7 @@ class SilentReporter:
 
 @contextmanager
 def repeated(act: Callable[[], None], seconds: float) -> Iterator[None]:
-    """Call ``act`` in a thread every so many seconds until the block ends."""
+    """Call ``act`` in a thread every ``seconds`` until the block ends."""
     ended = threading.Event()
 
     def loop() -> None:

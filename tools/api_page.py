@@ -23,20 +23,20 @@ first use. More scripts are in `examples/`.
 ```python
 import cleargs as cg
 
-run = cg.run("walk.mp4", quality="draft", progress=print)   # makes the folder walk, as `cleargs run walk.mp4`
+run = cg.run("walk.mp4", quality="draft", progress=print)  # makes the folder walk, as `cleargs run walk.mp4`
 print(run["rva"].table("frames").select(["name", "role", "weight"]))
 
-scene = run.scene()                                          # Gaussians and rendering options
-capture = cg.open_prepared(run["ingest"])                    # frames, cameras, sparse points
-camera = next(iter(capture.cameras().values()))              # of the first frame with a pose
-image = cg.render_view(scene, camera).image                  # [H, W, 3]
+scene = run.scene()  # Gaussians and rendering options
+capture = cg.open_prepared(run["ingest"])  # frames, cameras, sparse points
+camera = next(iter(capture.cameras().values()))  # of the first frame with a pose
+image = cg.render_view(scene, camera).image  # [H, W, 3]
 
-cg.export(run, "walk-z-up.ply", up="z")                      # for Blender
-cg.film(run, "walk-film.mp4", seconds=6)                     # along the path of the capture
+cg.export(run, "walk-z-up.ply", up="z")  # for Blender
+cg.film(run, "walk-film.mp4", seconds=6)  # along the path of the capture
 
-splats = scene.to_gsplat()                                   # arguments of gsplat.rasterization
-capture.to_nerfstudio("walk-data")                           # for nerfstudio, gsplat, Brush and others
-dataset = capture.dataset()                                  # for your own training in torch
+splats = scene.to_gsplat()  # arguments of gsplat.rasterization
+capture.to_nerfstudio("walk-data")  # for nerfstudio, gsplat, Brush and others
+dataset = capture.dataset()  # for your own training in torch
 ```
 
 A synthetic capture has sharp images of the truth. After `cleargs demo`:
