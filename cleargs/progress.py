@@ -170,23 +170,32 @@ class LineReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         last = begin = time.monotonic()
+        end: float | None = None
+        """Expected end of the task, by the clock of `last`."""
         if total is None:  # there may be no other line until the end
             self._progress(f"{label}: started")
 
-        def line(done: int, note: str, rest: str) -> None:
+        def line() -> None:
             nonlocal last
             last = time.monotonic()
-            count = f"{label}: {done}/{total}" if total else f"{label}: {done}" if done else label
-            self._progress(", ".join(filter(None, (count, note, rest))))
+            count = (
+                f"{label}: {task.done}/{total}" if total else f"{label}: {task.done or ''}".removesuffix(": ")
+            )
+            rest = (
+                f"{end - last:.0f} s left" if end is not None and end >= last else f"for {last - begin:.0f} s"
+            )
+            self._progress(", ".join(filter(None, (count, task.note, rest))))
 
         def show(done: int, note: str, left: float | None) -> None:
-            if time.monotonic() - last >= LINE_EVERY:
-                line(done, note, "" if left is None else f"{left:.0f} s left")
+            nonlocal end
+            now = time.monotonic()
+            end = None if left is None else now + left
+            if now - last >= LINE_EVERY:
+                line()
 
         def still_there() -> None:
-            now = time.monotonic()
-            if now - last >= 0.8 * LINE_EVERY and self._open[-1:] == [label]:
-                line(task.done, task.note, f"for {now - begin:.0f} s")
+            if time.monotonic() - last >= 0.8 * LINE_EVERY and self._open[-1:] == [label]:
+                line()
 
         task = CountedTask(total, show)
         self._open.append(label)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 from threading import Event
 
@@ -80,6 +81,24 @@ def test_a_task_without_steps_says_that_it_works(monkeypatch: pytest.MonkeyPatch
     with reporter.task("all scenes", 3), reporter.task("compiling"):
         assert seen.wait(20)
     assert not [line for line in lines if line.startswith("all scenes, for")], "the innermost task speaks"
+
+
+def test_a_line_without_a_step_keeps_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.02)
+    lines: list[str] = []
+    seen = Event()
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 3:
+            seen.set()
+
+    with LineReporter(say, say, say).task("cues", 1000) as task:
+        task.advance()
+        task.update(done=2, share=0.001 + 1e-9)  # so that the rest takes long
+        lines.clear()
+        assert seen.wait(20)
+    assert all(re.fullmatch(r"cues: 2/1000, \d+ s left", line) for line in lines[:3]), lines
 
 
 def test_remarks_of_the_library_are_logged(
