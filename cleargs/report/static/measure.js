@@ -158,6 +158,7 @@
     else window.reportStage.viewer.app.off("update", follow);
     stage.toggleAttribute("data-measures", measures);
     panel.hidden = !measures;
+    stage.scrollIntoView({ block: "nearest" });
     points = [];
     show();
   });
