@@ -8,8 +8,9 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest, has_results, linked_manifest
+from cleargs.own_files import refuse_links
 from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.run_file import SCENE as SCENE
@@ -28,6 +29,7 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
     if run.is_file():
         raise InputError("--stage chooses among the scenes of a run", hint="leave it out for a file")
+    check_results(dag, run)
     done = [name for name in dag.names if scene_path(run, name).is_file() and has_results(run, name)]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:
@@ -36,6 +38,18 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     message = f"{stage} has no scene in {run}" if stage else f"there is no scene in {run}"
     others = f"; the stages with a scene are {', '.join(done)}" if done else ""
     raise InputError(message, hint=f"see cleargs status {run}{others}")
+
+
+def check_results(dag: Dag, run: Path) -> None:
+    """Raise StoreError if results in ``run`` are behind a link that the store did not make, or have one."""
+    if read_pack(run) is not None:
+        refuse_links([run / SCENE])
+    for stage in dag.names:
+        if (run / stage).exists() and not has_results(run, stage):
+            raise StoreError(
+                f"{run / stage} is a link that leads elsewhere, or a link or a device is in it",
+                hint=f"remove it, then see cleargs status {run}",
+            )
 
 
 def scene_path(run: Path, stage: str) -> Path:

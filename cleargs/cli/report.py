@@ -31,7 +31,7 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import opened_store
-from cleargs.report.report_json import ENTRY, is_current, linked_manifests, page_of
+from cleargs.report.report_json import ENTRY, is_current, is_own_page, linked_manifests, page_of
 
 
 @click.command(
@@ -82,6 +82,8 @@ def report(
         if target.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"{target} does not end in .html", hint="name the file NAME.html")
         check_outputs([target], dag, run)
+        if target.exists() and not is_own_page(target):
+            raise InputError(f"{target} exists and is not a report of ClearGS", hint="choose another name")
     from cleargs.report.page import write_report
     from cleargs.report.single_file import write_single_file
 

@@ -89,6 +89,7 @@ Examples:
     help="Show all facts about frame N, and write a picture of its layers.",
 )
 @click.option("-o", "--output", type=FILE, help="File of --frame (.png).  [default: RUN/frame-N.png]")
+@click.option("--force", is_flag=True, help="Replace an existing file of --output.")
 @json_option
 @click.pass_obj
 def show(
@@ -98,6 +99,7 @@ def show(
     columns: bool,
     frame: int | None,
     output: Path | None,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Show the results of the stages of RUN, or the tables of one STAGE."""
@@ -113,7 +115,7 @@ def show(
     done = linked_manifests(run, dag.names)
     if frame is not None:
         picture = output or run / f"frame-{frame:06d}.png"
-        check_outputs([picture], dag, run)
+        check_outputs([picture], dag, run, force=force or output is None)
         _show_frame(run, done, frame, None if read_pack(run) else picture, as_json)
     elif stage is None:
         if as_json:

@@ -28,6 +28,7 @@ from cleargs.manifest import (
     versions,
     write_manifest,
 )
+from cleargs.own_files import drop_links
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import exclusive_lock
@@ -241,6 +242,7 @@ class Runner(Planner):
             stage_key.parts.key, forced=forced, entry=entry, leftovers=stage.LEFTOVERS, locked=locked
         )
         context = self.context(name, stage_key.inputs, work)
+        drop_links(context.cache, in_place=context.cache)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
         try:

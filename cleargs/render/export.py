@@ -83,7 +83,7 @@ def export_scene(
     if options.world == "input" and (offset := far_offset(scene.gaussians, similarity)):
         similarity["translation"] = similarity["translation"] - np.array(offset)
         file = outputs[0].with_name(f"{_stem(outputs[0])}.offset.json")
-        check_outputs([file], installed(), run)
+        check_outputs([file], installed(), run, force=options.force)
         write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
         messages.append(
             "single precision would round positions so far from the origin: the files are written without "
