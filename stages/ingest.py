@@ -67,7 +67,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update={"max_frames": frames, "max_size": size})
 
 
-VERSION = 17
+VERSION = 18
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -163,6 +163,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     capture = select_sharp_frames(capture, long_side, reporter)
     frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
+    scene = scene.turned_up(frames, reporter)
     scene, motion = measure_motion(capture, frames, scene, work, reporter)
     registered = {image.name for image in scene.model.images.values()}
     test = held_out(
@@ -195,6 +196,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "points": len(model.point_ids),
             "observations": sum(len(image.point_ids) for image in model.images.values()),
             "mean_reprojection_error_px": round(float(model.error.mean()), 6),
+            "up": "found" if scene.stood else "tops of the pictures",
             "similarity": scene.similarity.to_json(),
         }
     )

@@ -223,8 +223,11 @@ class Similarity:
             ) from error
 
 
-def normalise(poses: Sequence[Pose]) -> Similarity:
-    """Return the similarity to the normalised world. Raises InputError if all cameras are at one place."""
+def normalise(poses: Sequence[Pose], up: NDArray[np.float64] | None = None) -> Similarity:  # up [3]
+    """Return the similarity to the normalised world. Raises InputError if all cameras are at one place.
+
+    If ``up`` is None, it is the mean direction to the tops of the pictures.
+    """
     centres = np.stack([pose.centre for pose in poses])
     origin = centres[0] + (centres - centres[0]).mean(axis=0)
     scale = float(np.linalg.norm(centres - origin, axis=1).max())
@@ -233,11 +236,12 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
             "all cameras are at the same place: no point can be triangulated",
             hint="the camera must move, not only turn; check the poses, or set ingest.poses=sfm",
         )
-    up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
-    return Similarity(_up_rotation(up), origin, scale)
+    if up is None:
+        up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
+    return Similarity(upright(up), origin, scale)
 
 
-def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the smallest rotation that takes ``up`` to -y.
 
     If ``up`` is near +y, the axis of the smallest rotation depends on rounding errors. Then a half turn about

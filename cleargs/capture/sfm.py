@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 
 from cleargs.capture.adjustment import FIRST_LENS
-from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
+from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise, upright
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.database import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.upright import find_up, stated_up
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.media.image import lens_name, stated_focal
@@ -49,6 +50,8 @@ class Reconstruction:
     model: SparseModel
     similarity: Similarity
     outcome: SfmOutcome
+    stood: bool = False
+    """True if its up is not the mean direction to the tops of the pictures (`find_up`)."""
 
     def with_model(self, model: SparseModel) -> tuple[Reconstruction, float]:
         """Return the reconstruction with an adjusted ``model``, and the factor by which its lengths changed.
@@ -57,10 +60,27 @@ class Reconstruction:
         """
         if self.outcome.method != "sfm":
             return replace(self, model=model), 1.0
-        again = normalise([image.pose for _, image in sorted(model.images.items())])
+        up = np.array([0.0, -1.0, 0.0]) if self.stood else None
+        again = normalise([image.pose for _, image in sorted(model.images.items())], up)
         return replace(
             self, model=model.moved(again), similarity=self.similarity.then(again)
         ), 1 / again.scale
+
+    def turned_up(self, frames: Sequence[WorkFrame], reporter: Reporter) -> Reconstruction:
+        """Return the reconstruction with up as `find_up` finds it. A guess is reported."""
+        files = {frame.image: frame.source for frame in frames}
+        stated = {
+            name: stated_up(source.path) if source.up is None and source.pts is None else source.up
+            for name, source in files.items()
+        }
+        up, told = find_up(self.model, {name: np.array(up) for name, up in stated.items() if up is not None})
+        if told:
+            reporter.info(told)
+        if up is None:
+            return self
+        turn = Similarity(upright(up), np.zeros(3), 1.0)
+        turned = self.model.moved(turn)
+        return replace(self, model=turned, similarity=self.similarity.then(turn), stood=True)
 
     def cameras(self) -> list[dict[str, Any]]:
         """Return lens, mean focal length (px) and number of frames of each camera."""
@@ -95,8 +115,8 @@ def reconstruct(
         job = job_of(frames, None, folder, config, seed, threads)
         try:
             model, outcome = _found(job, reporter)
-        except StageError:
-            if not any(map(stated_focal, filter(None, job.exif_images))):
+        except StageError as error:
+            if str(error) == NO_DEPTH or not any(map(stated_focal, filter(None, job.exif_images))):
                 raise
             reporter.warn(
                 "with the focal length in the EXIF data of the images too few frames could be placed: "

@@ -15,6 +15,13 @@ from cleargs.capture.config import SfmConfig
 OWN = "own"
 """Convention of an input's poses: the one of its layout."""
 
+NO_DEPTH = (
+    "the frames show no depth: the camera only turned or zoomed on one spot, or all that it shows is flat "
+    "(a homography explains the matches of distant frames)"
+)
+MOVE = "move, do not only turn: walk around the subject, sideways, with things at different distances in view"
+"""Cause and remedy if no frames differ by parallax (`cleargs.capture.parallax`)."""
+
 OUTCOME = "outcome.json"
 """File in the folder of a model, with its `SfmOutcome`."""
 

@@ -32,8 +32,9 @@ from cleargs.capture.database import (
     why_missing,
 )
 from cleargs.capture.kept_out import epipolar_errors, fitting_shares, verified_matches, weakest_join
+from cleargs.capture.parallax import shows_depth
 from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
-from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import MOVE, NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
@@ -112,6 +113,8 @@ class Sfm(Features):
         if job.poses is not None:
             model, outcome = self._from_poses(job.poses, pairs)
         else:
+            if not shows_depth(self.database):
+                raise StageError(NO_DEPTH, hint=MOVE)
             model, placed = self.mapped(pairs)
             if job.config.camera_model == "auto":
                 self._report(phase="measuring the lens", total=None)
