@@ -160,7 +160,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     if len(capture.frames) < FEW_FRAMES:
         reporter.warn(f"there are only {len(capture.frames)} frames; a good scene needs 30 or more")
     long_side = max(config.feature_size, config.max_size)
-    capture = select_sharp_frames(capture, long_side, reporter)
+    capture = select_sharp_frames(capture, long_side, reporter, by_motion=config.fps is None)
     frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
     scene = scene.turned_up(frames, reporter)

@@ -58,10 +58,10 @@ def pairs_with_depth(database: Path) -> tuple[int, int]:
             found[one, two] = first[near], second[near]
             motion[one, two] = float(np.median(np.linalg.norm(moved[near], axis=1))) / max(size[two])
     farthest: dict[int, tuple[float, tuple[int, int]]] = {}
-    for pair, moved in motion.items():
-        if _MOVES[0] <= moved <= _MOVES[1]:
+    for pair, length in motion.items():
+        if _MOVES[0] <= length <= _MOVES[1]:
             for image in pair:
-                farthest[image] = max(farthest.get(image, (0.0, pair)), (moved, pair))
+                farthest[image] = max(farthest.get(image, (0.0, pair)), (length, pair))
     shares = []
     for one, two in sorted({pair for _, pair in farthest.values()}):
         sides = *found[one, two], size[one], size[two]
@@ -86,8 +86,8 @@ def _unexplained(
     limit = max(_OFF_PX, _OFF * max(two))
     a, b = _straightened(first, one, bend), _straightened(second, two, bend)
     cv2.setRNGSeed(0)
-    found, _ = cv2.findHomography(a, b, cv2.RANSAC, limit, maxIters=300)
-    if found is None:
+    found = np.asarray(cv2.findHomography(a, b, cv2.RANSAC, limit, maxIters=300)[0])
+    if found.shape != (3, 3):  # none was found
         return 1.0
     off = cv2.perspectiveTransform(a[:, None], found)[:, 0] - b
     return float((np.linalg.norm(off, axis=1) > limit).mean())
