@@ -29,7 +29,7 @@ _RIM = 2  # px around the things that turn which still belong to them
 
 @dataclass(frozen=True, eq=False)
 class StillRoom:
-    """What stays where it is in the pictures, while something before it turns."""
+    """The part of the pictures that stays in its place, while something before it turns."""
 
     picture: NDArray[np.float32]  # [H, W] grey
     region: NDArray[np.uint8]  # [H, W], 1 where the room is known

@@ -98,6 +98,13 @@ class Intrinsics:
         camera.rescale(width, height)
         return Intrinsics(self.model, width, height, tuple(camera.params.tolist()))
 
+    def moved(self, across: float, down: float) -> Intrinsics:
+        """Return the camera with its principal point moved, px."""
+        camera = self.colmap()
+        camera.principal_point_x += across
+        camera.principal_point_y += down
+        return Intrinsics(self.model, self.width, self.height, tuple(camera.params.tolist()))
+
     def colmap(self) -> pycolmap.Camera:
         """Return the pycolmap camera. The import is here, so that inputs can be looked up without it."""
         from cleargs.capture.colmap import pycolmap

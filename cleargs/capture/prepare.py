@@ -85,7 +85,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     if room is not None:
         reporter.warn(
             f"two motions: {room.share:.0%} of the picture is a still room before a camera that stands, and "
-            "something turns or moves before it. What moves is reconstructed, the room is masked"
+            "something turns or moves before it. The room is masked, and the rest is reconstructed"
         )
     prepared = [
         _work_frame(frame, path, masks / f"{path.name}.png", _unseen(path, still, room))
@@ -105,7 +105,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
 
 
 def _unseen(path: Path, still: MaskU8 | None, room: StillRoom | None) -> MaskU8 | None:  # [H, W]
-    """Return the mask of what is no scene in the working image ``path``, or None."""
+    """Return the mask of the working image ``path`` without its still parts, or None."""
     if room is None:
         return still
     mask = room.mask(read_rgb(path))

@@ -83,13 +83,12 @@ class Reconstruction:
         return replace(self, model=turned, similarity=self.similarity.then(turn), stood=True)
 
     def cameras(self) -> list[dict[str, Any]]:
-        """Return lens, mean focal length (px) and number of frames of each camera."""
-        frames = Counter(image.camera_id for image in self.model.images.values())
-        return [
-            {"lens": camera.model, "focal_px": round(sum(camera.focal) / 2, 3), "frames": frames[key]}
-            for key, camera in self.model.cameras.items()
-            if frames[key]
-        ]
+        """Return lens, mean focal length (px) and number of frames of each lens."""
+        frames: Counter[tuple[str, float]] = Counter()
+        for image in self.model.images.values():
+            camera = self.model.cameras[image.camera_id]
+            frames[camera.model, round(sum(camera.focal) / 2, 3)] += 1
+        return [{"lens": lens, "focal_px": focal, "frames": n} for (lens, focal), n in frames.items()]
 
 
 def reconstruct(
@@ -127,6 +126,12 @@ def reconstruct(
             job = job.model_copy(update={"folder": alone, "exif_images": [None] * len(job.exif_images)})
             model, outcome = _found(job, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
+        if outcome.shifts_px:
+            reach = max(abs(shift) for pair in outcome.shifts_px.values() for shift in pair)
+            reporter.warn(
+                f"the picture moves by up to {reach:.0f} px against the lens, as in stabilised video: each "
+                "frame gets its own image centre. Film without stabilisation if you can"
+            )
         if outcome.torn_at is not None:
             reporter.warn(
                 f"the frames before {frames[outcome.torn_at].source.name} may be at another scale: "
@@ -322,7 +327,8 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]
 def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
     """Return the model and the outcome of COLMAP's process. Raises InputError if one is damaged."""
     with faults_as(InputError, f"{OUTCOME} cannot be read", hint="run ingest again"):
-        return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
+        outcome = SfmOutcome.model_validate(read_json(folder / OUTCOME))
+        return read_model(folder).shifted(outcome.shifts_px), outcome
 
 
 def _within_reach(model: SparseModel) -> SparseModel:

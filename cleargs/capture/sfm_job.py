@@ -60,5 +60,7 @@ class SfmOutcome(FrozenModel):
     """Method -> median distance of the kept-out matches from their epipolar lines, px."""
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
+    shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)
+    """Working image -> shift of its picture by a stabiliser, px; empty: none was found."""
     torn_at: int | None = None
     """Number of the first frame after a join that matches contradict (`weakest_join`); None: no such join."""
