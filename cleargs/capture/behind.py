@@ -22,7 +22,7 @@ _SHOWN = 0.35
 _EDGE = 40.0  # Sobel response of the median picture, levels per pixel times 4, from which it has structure
 _ROOM, _TURNS = 0.06, 0.04
 """Minimum share of the pixels that are structured and still in most pictures, and of those that change. The
-median picture of a camera that moves has next to no structure that single pictures share."""
+median picture of a camera that moves has little structure that single pictures share."""
 _REACH = 0.1  # distance between structures of the room, in long sides, up to which all between them is room
 _RIM = 2  # px around the things that turn which still belong to them
 
