@@ -84,8 +84,8 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     room = still_room(paths)
     if room is not None:
         reporter.warn(
-            f"two motions: {room.share:.0%} of the picture is a still room before a camera that stands, and "
-            "something turns or moves before it. The room is masked, and the rest is reconstructed"
+            f"two motions: {room.share:.0%} of the picture is still in most frames (the room around a turntable, "
+            "a dashboard, a screen), and the rest moves. The still part is masked, the rest is reconstructed"
         )
     prepared = [
         _work_frame(frame, path, masks / f"{path.name}.png", _unseen(path, still, room))

@@ -15,23 +15,30 @@ from cleargs.synth.room import make_room
 from .conftest import Ingest
 from .filmed import film, stabilised, turntable, walk, write
 
-SIZE = (240, 180)
-
 
 @pytest.mark.slow
 def test_what_turns_before_a_still_room_is_reconstructed(tmp_path: Path, ingest: Ingest) -> None:
-    done = ingest(write(tmp_path / "in", turntable(2, 24, SIZE)))
+    done = ingest(write(tmp_path / "in", turntable(2, 30)))
     summary = done.result.summary
-    assert summary["registered"] == 24
-    assert summary["cameras"][0]["focal_px"] == pytest.approx(188, rel=0.1)
+    assert summary["registered"] == 30
+    assert summary["cameras"][0]["focal_px"] == pytest.approx(251, rel=0.1)
     assert any("two motions" in warning for warning in done.warnings)
     masked = [np.mean(read_rgb(path) == 0) for path in sorted((done.out / "masks").iterdir())]
-    assert len(masked) == 24 and 0.4 < np.mean(masked) < 0.9
+    assert len(masked) == 30 and 0.4 < np.mean(masked) < 0.9
 
 
-def test_a_walk_has_no_still_room(tmp_path: Path) -> None:
-    folder = write(tmp_path / "in", film(make_room(3), walk(3, 10), size=(160, 120)))
+@pytest.mark.parametrize("frames", [8, 12])
+def test_a_walk_has_no_still_room(tmp_path: Path, frames: int) -> None:
+    folder = write(tmp_path / "in", film(make_room(3), walk(3, frames), size=(160, 120)))
     assert still_room(sorted(folder.iterdir())) is None
+
+
+def test_the_room_around_a_turntable_is_masked_and_the_things_are_not(tmp_path: Path) -> None:
+    folder = write(tmp_path / "in", turntable(4, 10, (160, 120)))
+    room = still_room(sorted(folder.iterdir()))
+    assert room is not None and room.share > 0.5
+    masks = np.stack([room.mask(read_rgb(path)) for path in sorted(folder.iterdir())])
+    assert (masks[:, :30] == 0).mean() > 0.6 and (masks[:, 55:70, 50:110] == 255).mean() > 0.6
 
 
 @pytest.mark.slow
