@@ -84,7 +84,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     room = still_room(paths)
     if room is not None:
         reporter.warn(
-            f"two motions: {room.share:.0%} of the picture is still in most frames (the room around a turntable, "
+            f"two motions: {room.share:.0%} of the picture is still in most frames (the room of a turntable, "
             "a dashboard, a screen), and the rest moves. The still part is masked, the rest is reconstructed"
         )
     prepared = [
