@@ -160,9 +160,10 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     if len(capture.frames) < FEW_FRAMES:
         reporter.warn(f"there are only {len(capture.frames)} frames; a good scene needs 30 or more")
     long_side = max(config.feature_size, config.max_size)
-    capture = select_sharp_frames(capture, long_side, reporter)
+    capture = select_sharp_frames(capture, long_side, reporter, by_motion=config.fps is None)
     frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
+    scene = scene.turned_up(frames, reporter)
     scene, motion = measure_motion(capture, frames, scene, work, reporter)
     registered = {image.name for image in scene.model.images.values()}
     test = held_out(
@@ -195,6 +196,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "points": len(model.point_ids),
             "observations": sum(len(image.point_ids) for image in model.images.values()),
             "mean_reprojection_error_px": round(float(model.error.mean()), 6),
+            "up": "found" if scene.stood else "tops of the pictures",
             "similarity": scene.similarity.to_json(),
         }
     )

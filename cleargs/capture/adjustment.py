@@ -126,14 +126,19 @@ class Adjuster:
 
     def bundle_adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
         """Return ``model`` after one bundle adjustment and a triangulation without the kept-out matches."""
-        options = pycolmap.BundleAdjustmentOptions(refine_focal_length=cameras, refine_extra_params=cameras)
-        options.print_summary = False
-        # A robust loss, because some matches are still wrong.
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.solver_options.num_threads = 1
-        options.ceres.solver_options.function_tolerance = _TOLERANCE
-        pycolmap.bundle_adjustment(model, options)
+        adjust_all(model, cameras=cameras)
         return self._triangulate(model, self._cut)
+
+
+def adjust_all(model: pycolmap.Reconstruction, *, cameras: bool = True) -> None:
+    """Adjust poses, points and, with ``cameras``, lenses of ``model`` in one bundle adjustment."""
+    options = pycolmap.BundleAdjustmentOptions(refine_focal_length=cameras, refine_extra_params=cameras)
+    options.print_summary = False
+    # A robust loss, because some matches are still wrong.
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.function_tolerance = _TOLERANCE
+    pycolmap.bundle_adjustment(model, options)
 
 
 def lens_of(model: pycolmap.Reconstruction) -> str:

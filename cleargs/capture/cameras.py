@@ -98,6 +98,13 @@ class Intrinsics:
         camera.rescale(width, height)
         return Intrinsics(self.model, width, height, tuple(camera.params.tolist()))
 
+    def moved(self, across: float, down: float) -> Intrinsics:
+        """Return the camera with its principal point moved, px."""
+        camera = self.colmap()
+        camera.principal_point_x += across
+        camera.principal_point_y += down
+        return Intrinsics(self.model, self.width, self.height, tuple(camera.params.tolist()))
+
     def colmap(self) -> pycolmap.Camera:
         """Return the pycolmap camera. The import is here, so that inputs can be looked up without it."""
         from cleargs.capture.colmap import pycolmap
@@ -223,8 +230,11 @@ class Similarity:
             ) from error
 
 
-def normalise(poses: Sequence[Pose]) -> Similarity:
-    """Return the similarity to the normalised world. Raises InputError if all cameras are at one place."""
+def normalise(poses: Sequence[Pose], up: NDArray[np.float64] | None = None) -> Similarity:  # up [3]
+    """Return the similarity to the normalised world. Raises InputError if all cameras are at one place.
+
+    If ``up`` is None, it is the mean direction to the tops of the pictures.
+    """
     centres = np.stack([pose.centre for pose in poses])
     origin = centres[0] + (centres - centres[0]).mean(axis=0)
     scale = float(np.linalg.norm(centres - origin, axis=1).max())
@@ -233,11 +243,12 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
             "all cameras are at the same place: no point can be triangulated",
             hint="the camera must move, not only turn; check the poses, or set ingest.poses=sfm",
         )
-    up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
-    return Similarity(_up_rotation(up), origin, scale)
+    if up is None:
+        up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
+    return Similarity(upright(up), origin, scale)
 
 
-def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the smallest rotation that takes ``up`` to -y.
 
     If ``up`` is near +y, the axis of the smallest rotation depends on rounding errors. Then a half turn about

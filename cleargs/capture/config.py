@@ -23,7 +23,10 @@ class CaptureConfig(FrozenModel):
         "alone decides",
     )
     max_frames: int = Field(
-        150, ge=3, description="most frames to take, evenly; in a video, the sharpest nearby"
+        150,
+        ge=3,
+        description="most frames to take, evenly; in a video, the sharpest nearby, and evenly by the motion "
+        "of the picture if the pace is uneven and fps is unset",
     )
     start: float | None = Field(
         None, ge=0, description="take a video from this time on, s; unset: from its first frame on"

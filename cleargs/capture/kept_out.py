@@ -36,8 +36,8 @@ Matches = dict[tuple[int, int], tuple[Pixels, Pixels]]
 def verified_matches(database: Path) -> Matches:
     """Return the matches in ``database`` that COLMAP verified."""
     with pycolmap.Database.open(database) as opened:
-        pixels = _pixels(opened)
-        found = {pair: geometry.inlier_matches for pair, geometry in _geometries(opened).items()}
+        pixels = pixels_in(opened)
+        found = {pair: geometry.inlier_matches for pair, geometry in geometries_in(opened).items()}
     return {
         (one, two): (pixels[one][rows[:, 0]], pixels[two][rows[:, 1]])
         for (one, two), rows in found.items()
@@ -56,7 +56,7 @@ def keep_out(database: Path) -> tuple[Matches, float]:
     kept_out: Matches = {}
     alone = [np.zeros(0)]
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
-        pixels, geometries = _pixels(opened), _geometries(opened)
+        pixels, geometries = pixels_in(opened), geometries_in(opened)
         sizes = [len(xy) for xy in pixels.values()]
         start = dict(zip(pixels, np.cumsum([0, *sizes]).tolist(), strict=False))
         edges = {
@@ -139,7 +139,7 @@ def weakest_join(model: pycolmap.Reconstruction, database: Path) -> tuple[int, f
     }
     counts, holding = np.zeros((2, max(points, default=0) + 1))
     with pycolmap.Database.open(database) as opened:
-        geometries = _geometries(opened)
+        geometries = geometries_in(opened)
     for (one, two), geometry in geometries.items():
         if one in points and two in points and len(geometry.inlier_matches):
             first, second = (points[key][geometry.inlier_matches[:, k]] for k, key in enumerate((one, two)))
@@ -154,11 +154,11 @@ def _distances(first: Any, second: Any, matrix: NDArray[np.float64]) -> NDArray[
     return np.sqrt(pycolmap.compute_squared_sampson_error(first, second, matrix))
 
 
-def _pixels(opened: pycolmap.Database) -> dict[int, Pixels]:
+def pixels_in(opened: pycolmap.Database) -> dict[int, Pixels]:
     images = sorted(image.image_id for image in opened.read_all_images())
     return {key: np.asarray(opened.read_keypoints(key), np.float64)[:, :2] for key in images}
 
 
-def _geometries(opened: pycolmap.Database) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+def geometries_in(opened: pycolmap.Database) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
     pair_ids, geometries = opened.read_two_view_geometries()
     return dict(zip(map(pycolmap.pair_id_to_image_pair, pair_ids), geometries, strict=True))

@@ -163,7 +163,9 @@ def _follow(
 
 def _lenses(frames: Sequence[WorkFrame], model: SparseModel) -> dict[str, int]:
     """Return the number of the lens of each frame of ``model``: a camera in one video, or in a folder."""
-    by_name = {image.name: image.camera_id for image in model.images.values()}
+    # Frames of a stabilised video differ in the image centre only.
+    lens = {key: (camera.model, camera.focal) for key, camera in model.cameras.items()}
+    by_name = {image.name: lens[image.camera_id] for image in model.images.values()}
     owners = {
         frame.image: (by_name[frame.image], frame.source.path if frame.source.pts is not None else None)
         for frame in frames

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from cleargs.capture.behind import StillRoom, still_room
 from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.overlay import still_parts, wraps_around
@@ -80,7 +81,16 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             f"{(still == 0).mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
             "masked in all frames"
         )
-    prepared = [_work_frame(frame, path, masks / f"{path.name}.png", still) for frame, path in pairs]
+    room = still_room(paths)
+    if room is not None:
+        reporter.warn(
+            f"two motions: {room.share:.0%} of the picture is still in most frames (the room of a turntable, "
+            "a dashboard, a screen), and the rest moves. The still part is masked, the rest is reconstructed"
+        )
+    prepared = [
+        _work_frame(frame, path, masks / f"{path.name}.png", _unseen(path, still, room))
+        for frame, path in pairs
+    ]
     if any(made.masked for made in prepared):
         for made in prepared:  # COLMAP leaves out an image without a mask if others have one
             mask = masks / f"{made.image}.png"
@@ -92,6 +102,14 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             f"{transparent} of {len(prepared)} images are transparent in places: ignored, like masks"
         )
     return prepared
+
+
+def _unseen(path: Path, still: MaskU8 | None, room: StillRoom | None) -> MaskU8 | None:  # [H, W]
+    """Return the mask of the working image ``path`` without its still parts, or None."""
+    if room is None:
+        return still
+    mask = room.mask(read_rgb(path))
+    return mask if still is None else np.minimum(mask, still)
 
 
 def _is_intact(image: Path, reporter: Reporter) -> bool:

@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 
 from cleargs.capture.adjustment import FIRST_LENS
-from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
+from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise, upright
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.database import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.upright import find_up, stated_up
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.media.image import lens_name, stated_focal
@@ -49,6 +50,8 @@ class Reconstruction:
     model: SparseModel
     similarity: Similarity
     outcome: SfmOutcome
+    stood: bool = False
+    """True if its up is not the mean direction to the tops of the pictures (`find_up`)."""
 
     def with_model(self, model: SparseModel) -> tuple[Reconstruction, float]:
         """Return the reconstruction with an adjusted ``model``, and the factor by which its lengths changed.
@@ -57,19 +60,35 @@ class Reconstruction:
         """
         if self.outcome.method != "sfm":
             return replace(self, model=model), 1.0
-        again = normalise([image.pose for _, image in sorted(model.images.items())])
+        up = np.array([0.0, -1.0, 0.0]) if self.stood else None
+        again = normalise([image.pose for _, image in sorted(model.images.items())], up)
         return replace(
             self, model=model.moved(again), similarity=self.similarity.then(again)
         ), 1 / again.scale
 
+    def turned_up(self, frames: Sequence[WorkFrame], reporter: Reporter) -> Reconstruction:
+        """Return the reconstruction with up as `find_up` finds it. A guess is reported."""
+        files = {frame.image: frame.source for frame in frames}
+        stated = {
+            name: stated_up(source.path) if source.up is None and source.pts is None else source.up
+            for name, source in files.items()
+        }
+        up, told = find_up(self.model, {name: np.array(up) for name, up in stated.items() if up is not None})
+        if told:
+            reporter.info(told)
+        if up is None:
+            return self
+        turn = Similarity(upright(up), np.zeros(3), 1.0)
+        turned = self.model.moved(turn)
+        return replace(self, model=turned, similarity=self.similarity.then(turn), stood=True)
+
     def cameras(self) -> list[dict[str, Any]]:
-        """Return lens, mean focal length (px) and number of frames of each camera."""
-        frames = Counter(image.camera_id for image in self.model.images.values())
-        return [
-            {"lens": camera.model, "focal_px": round(sum(camera.focal) / 2, 3), "frames": frames[key]}
-            for key, camera in self.model.cameras.items()
-            if frames[key]
-        ]
+        """Return lens, mean focal length (px) and number of frames of each lens."""
+        frames: Counter[tuple[str, float]] = Counter()
+        for image in self.model.images.values():
+            camera = self.model.cameras[image.camera_id]
+            frames[camera.model, round(sum(camera.focal) / 2, 3)] += 1
+        return [{"lens": lens, "focal_px": focal, "frames": n} for (lens, focal), n in frames.items()]
 
 
 def reconstruct(
@@ -95,8 +114,8 @@ def reconstruct(
         job = job_of(frames, None, folder, config, seed, threads)
         try:
             model, outcome = _found(job, reporter)
-        except StageError:
-            if not any(map(stated_focal, filter(None, job.exif_images))):
+        except StageError as error:
+            if str(error) == NO_DEPTH or not any(map(stated_focal, filter(None, job.exif_images))):
                 raise
             reporter.warn(
                 "with the focal length in the EXIF data of the images too few frames could be placed: "
@@ -107,6 +126,12 @@ def reconstruct(
             job = job.model_copy(update={"folder": alone, "exif_images": [None] * len(job.exif_images)})
             model, outcome = _found(job, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
+        if outcome.shifts_px:
+            reach = max(abs(shift) for pair in outcome.shifts_px.values() for shift in pair)
+            reporter.warn(
+                f"the picture moves by up to {reach:.0f} px against the lens, as in stabilised video: each "
+                "frame gets its own image centre. Film without stabilisation if you can"
+            )
         if outcome.torn_at is not None:
             reporter.warn(
                 f"the frames before {frames[outcome.torn_at].source.name} may be at another scale: "
@@ -302,7 +327,8 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]
 def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
     """Return the model and the outcome of COLMAP's process. Raises InputError if one is damaged."""
     with faults_as(InputError, f"{OUTCOME} cannot be read", hint="run ingest again"):
-        return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
+        outcome = SfmOutcome.model_validate(read_json(folder / OUTCOME))
+        return read_model(folder).shifted(outcome.shifts_px), outcome
 
 
 def _within_reach(model: SparseModel) -> SparseModel:

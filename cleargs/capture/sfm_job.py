@@ -15,6 +15,13 @@ from cleargs.capture.config import SfmConfig
 OWN = "own"
 """Convention of an input's poses: the one of its layout."""
 
+NO_DEPTH = (
+    "the frames show no depth: the camera only turned or zoomed on one spot, or all that it shows is flat "
+    "(a homography explains the matches of distant frames)"
+)
+MOVE = "move, do not only turn: walk around the subject, sideways, with things at different distances in view"
+"""Cause and remedy if no frames differ by parallax (`cleargs.capture.parallax`)."""
+
 OUTCOME = "outcome.json"
 """File in the folder of a model, with its `SfmOutcome`."""
 
@@ -53,5 +60,7 @@ class SfmOutcome(FrozenModel):
     """Method -> median distance of the kept-out matches from their epipolar lines, px."""
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
+    shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)
+    """Working image -> shift of its picture by a stabiliser, px; empty: none was found."""
     torn_at: int | None = None
     """Number of the first frame after a join that matches contradict (`weakest_join`); None: no such join."""

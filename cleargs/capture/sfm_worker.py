@@ -20,7 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cleargs.capture.adjustment import FIRST_LENS, SHARED_BY, Adjuster, align_to, lens_of, median_residual
+from cleargs.capture.adjustment import (
+    FIRST_LENS,
+    SHARED_BY,
+    Adjuster,
+    adjust_all,
+    align_to,
+    lens_of,
+    median_residual,
+)
 from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
@@ -32,8 +40,10 @@ from cleargs.capture.database import (
     why_missing,
 )
 from cleargs.capture.kept_out import epipolar_errors, fitting_shares, verified_matches, weakest_join
+from cleargs.capture.parallax import shows_depth
 from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
-from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import MOVE, NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.steady import steadied
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
@@ -112,11 +122,18 @@ class Sfm(Features):
         if job.poses is not None:
             model, outcome = self._from_poses(job.poses, pairs)
         else:
+            if not shows_depth(self.database):
+                raise StageError(NO_DEPTH, hint=MOVE)
             model, placed = self.mapped(pairs)
             if job.config.camera_model == "auto":
                 self._report(phase="measuring the lens", total=None)
                 model = Adjuster(self._matched, self.with_points).with_measured_lens(model)
-            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model), torn_at=self._torn_at)
+            model, shifts = steadied(model, adjust_all)
+            shifted = {model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()}
+            torn = None if shifts else self._torn_at
+            outcome = SfmOutcome(
+                placed=placed, method="sfm", lens=lens_of(model), torn_at=torn, shifts_px=shifted
+            )
         make_folder(self.output, empty=True)
         model.write_binary(self.output)
         write_json(self.output / OUTCOME, outcome.model_dump())
