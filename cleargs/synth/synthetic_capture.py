@@ -153,7 +153,9 @@ def make_capture(
         for folder in ("observed/images", "observed/depth", "novel/images", "novel/depth"):
             (out / "truth" / folder).mkdir(parents=True)
         for stem, time, pose, own in zip(stems, times, poses, lenses, strict=True):
-            light, depth = _write_sharp(out / "truth" / "observed", stem, replace(setup, lens=own), pose, look)
+            light, depth = _write_sharp(
+                out / "truth" / "observed", stem, replace(setup, lens=own), pose, look
+            )
             luminances.append(phone.metered_luminance(light))
             motions.append(track_motion(path, float(time), depth, own))
             seen = depth[depth > 0]
@@ -203,11 +205,11 @@ def make_capture(
             write_video(out / "capture.mp4", all_shots(), NATIVE_FPS, bits, repeatable=True)
             write_table(out / "truth" / "motion.parquet", true_motion(native, images), MOTION)
     write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), FRAMES)
-    for kind, names, seen, exact in (
+    for kind, names, used, exact in (
         ("observed", stems, lenses, poses),
         ("novel", novel_stems, [setup.lens] * count, novel),
     ):
-        _write_transforms(out / "truth" / kind, seen, [f"images/{name}.png" for name in names], exact)
+        _write_transforms(out / "truth" / kind, used, [f"images/{name}.png" for name in names], exact)
     mean_depth = float(np.mean(depths))
     noise = {"rotation_deg": rules.rotation_noise, "translation": rules.translation_noise * mean_depth}
     summary = {
