@@ -37,7 +37,7 @@ Matches = dict[tuple[int, int], tuple[Pixels, Pixels]]
 
 @dataclass(frozen=True, eq=False)
 class KeptOut:
-    """What `keep_out` removed from a database."""
+    """Matches and tracks that `keep_out` removed from a database."""
 
     matches: Matches
     tracks: Tracks

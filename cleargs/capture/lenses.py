@@ -1,4 +1,4 @@
-"""Which lens a capture has, by tracks that no fit uses.
+"""Choice of the lens of a capture, by tracks that no fit uses.
 
 Incremental mapping assumes one perspective lens that does not change. A lens that zooms, breathes or is
 switched, and a fisheye, give poses that fit the features and are wrong: of a walk with a zoom of 1.8 the

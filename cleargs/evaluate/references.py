@@ -147,7 +147,7 @@ def reference_of(
             else:
                 similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
                 theirs = [similarity.pose(view.pose) for view in listed.values()]
-                _require_one_unit(theirs, [*own.values()], load_points(ingest).xyz)
+                _require_one_unit(theirs, [*own.values()], _points(ingest))
             views = [
                 replace(view.at(similarity.pose(view.pose)), unit=similarity.scale)
                 for view in listed.values()
@@ -196,11 +196,21 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         reporter.info(text)
 
 
+def _points(ingest: Path) -> ArrayF64:  # [P, 3]
+    """Return the sparse points of a run; none if it lacks their table."""
+    try:
+        return load_points(ingest).xyz
+    except StoreError:
+        return np.zeros((0, 3))
+
+
 def _require_one_unit(theirs: Sequence[Pose], ours: Sequence[Pose], points: ArrayF64) -> None:
     """Raise InputError if the references are far outside the scene, or all at one place of it.
 
     ``points`` [P, 3] are the scene's, in the world of both.
     """
+    if not ours:
+        return
     away, own = (np.stack([pose.centre for pose in poses]) for poses in (theirs, ours))
     middle = own.mean(axis=0)
     scene = np.concatenate([own, points])
