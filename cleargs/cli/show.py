@@ -48,7 +48,7 @@ LABELS: Mapping[str, str] = {
     "given_poses_missed_px": "median reprojection error at the given poses, px",
     "pose_convention": "convention of the given poses",
     "kept_out_matches_off_px": "median error of matches that the fit did not use, by origin of the poses, px",
-    "kept_out": "keypoints that took no part in the fit of the cameras",
+    "kept_out": "keypoints that no fit used",
     "keypoints": "keypoints",
     "share": "share within 2 px",
     "median_px": "median distance, px",
