@@ -177,7 +177,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     model = publish(frames, scene.model, outcome, test, work, context.out, config.max_size, reporter)
     write_motion(context.out / "motion.parquet", frames, motion)
     return StageResult(
-        missing=contradictions(outcome, reporter),
+        missing=contradictions(outcome, config, reporter),
         summary={
             "kind": capture.kind,
             "input": capture.told,

@@ -207,10 +207,11 @@ def _report_lens(
         )
 
 
-def contradictions(outcome: SfmOutcome, reporter: Reporter) -> tuple[str, ...]:
-    """Report how well the cameras predict the kept-out tracks. Return a line if these contradict them.
+def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -> tuple[str, ...]:
+    """Report the errors of the cameras at the kept-out keypoints. Return a line if these contradict them.
 
-    Raises StageError if they contradict them so much that no scene is possible.
+    Raises StageError if found cameras are so wrong that no scene is possible. Poses of the input that
+    ``config.refine_above`` keeps give a warning only.
     """
     found = outcome.prediction
     if found is None or found.keypoints < MIN_KEYPOINTS:
@@ -219,11 +220,15 @@ def contradictions(outcome: SfmOutcome, reporter: Reporter) -> tuple[str, ...]:
         f"of {found.keypoints} keypoints that took no part in the fit, {found.share:.0%} are within 2 px of "
         f"their places (median {found.median_px:.2g} px)"
     )
-    if found.share < LEAST_SHARE:
+    if found.share < LEAST_SHARE and outcome.method == "sfm":
         raise StageError(f"the cameras are wrong: {figure}", hint=_DOUBT)
-    if found.share < GOOD_SHARE:
+    kept = outcome.method == "given" and (outcome.missed_px or 0.0) <= config.refine_above
+    if found.share < GOOD_SHARE and kept:
+        reporter.warn(f"the poses of the input are doubtful: {figure}; ingest.refine_above keeps them")
+    elif found.share < GOOD_SHARE:
         return (f"cameras that the images confirm: {figure}, fewer than {GOOD_SHARE:.0%}; {_DOUBT}",)
-    reporter.info(f"cameras: {figure}")
+    else:
+        reporter.info(f"cameras: {figure}")
     return ()
 
 
