@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,11 +20,8 @@ from cleargs.capture.cameras import MAX_ASPECT, MAX_FOCAL, MIN_FOCAL
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.motion import TWIST, projected
 from cleargs.capture.prediction import WITHIN_PX, prediction_errors
-from cleargs.capture.sfm_job import Prediction
+from cleargs.capture.sfm_job import Job, Prediction
 from cleargs.types import ArrayF64
-
-if TYPE_CHECKING:
-    from cleargs.capture.sfm_worker import Sfm
 
 FISHEYE = "OPENCV_FISHEYE"
 DOUBTFUL = 0.8
@@ -45,6 +42,19 @@ FISHEYE_AHEAD = 1.03
 """A fisheye is tried if this number of times as many matches fit one as fit a perspective lens."""
 SEARCHED_PAIRS, MIN_MATCHES, SEARCH_PX = 12, 60, 1.0
 """Most pairs of frames of a search, fewest matches of a pair, and distance of a match that fits."""
+
+
+class Steps(Protocol):
+    """The parts of `cleargs.capture.sfm_worker.Sfm` that are used here."""
+
+    job: Job
+    used_database: Path
+
+    def with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
+        """See `Sfm.with_points`."""
+
+    def variant(self, name: str, **changes: Any) -> Steps:
+        """See `Sfm.variant`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +109,7 @@ def is_impossible(camera: pycolmap.Camera) -> bool:
     return max(fx, fy) > MAX_ASPECT * min(fx, fy) or not (stated or MIN_FOCAL <= share <= MAX_FOCAL)
 
 
-def fitted(sfm: Sfm, model: pycolmap.Reconstruction, like: Adjuster | None = None) -> Fit:
+def fitted(sfm: Steps, model: pycolmap.Reconstruction, like: Adjuster | None = None) -> Fit:
     """Return ``model``, which all matches made, with the lens that predicts the kept-out tracks best.
 
     The tracks that ``like`` keeps out are kept out too.
