@@ -26,6 +26,11 @@ OUTCOME = "outcome.json"
 """File in the folder of a model, with its `SfmOutcome`."""
 
 
+GOOD_SHARE, LEAST_SHARE, MIN_KEYPOINTS = 0.5, 0.25, 100
+"""Shares of the kept-out keypoints within 2 px below which ingest is done only in part, and fails; fewest
+keypoints that count."""
+
+
 class Job(FrozenModel):
     """Input of COLMAP: working images, their cameras, the poses if they are known, and settings."""
 
@@ -40,9 +45,22 @@ class Job(FrozenModel):
     """Convention that the input may mean -> matrices 3x4, world to camera, of all images."""
     exif_images: list[Path | None]
     """Input image of each camera that may state its focal length."""
+    known_focal: Mapping[str, float] = Field(default_factory=dict)
+    """Kind of lens -> focal length that the user states, in long sides."""
+    focal_known: bool = False
+    """True if the focal lengths of the cameras are stated by the user, or searched."""
     config: SfmConfig
     seed: int
     threads: int
+
+
+class Prediction(FrozenModel):
+    """Figure of the errors of cameras at keypoints of tracks that took no part in their fit."""
+
+    keypoints: int
+    share: float
+    """Share within `cleargs.capture.prediction.WITHIN_PX`."""
+    median_px: float
 
 
 class SfmOutcome(FrozenModel):
@@ -58,6 +76,10 @@ class SfmOutcome(FrozenModel):
     """Origin of the poses: the input's, the input's after adjustment, or structure from motion."""
     errors_px: Mapping[str, float] = Field(default_factory=dict)
     """Method -> median distance of the kept-out matches from their epipolar lines, px."""
+    prediction: Prediction | None = None
+    """Figure of all frames; None: not measured, or there are none."""
+    predictions: Mapping[str, Prediction] = Field(default_factory=dict)
+    """The same by working image."""
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
     shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)

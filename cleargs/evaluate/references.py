@@ -43,6 +43,10 @@ LARGE_RESIDUAL = 0.02
 MAX_RESIDUAL = 0.05
 """Residual above which there is an error: each view would be rendered far from its reference."""
 
+MAX_OUTSIDE, MIN_SPREAD = 3.0, 0.01
+"""Distance of the references, in reaches of the scene, and spread of them, in that of the frames, from which
+the units of both differ."""
+
 SAME_VIEW = 0.05
 """Two views are the same if their centres are closer than this (the farthest camera is 1 from the mean), and
 their angle is below this, rad. Pose noise is smaller, and the next view of a set is mostly farther."""
@@ -142,6 +146,8 @@ def reference_of(
                 _report_fit(alignment, align or directory, reporter)
             else:
                 similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
+                theirs = [similarity.pose(view.pose) for view in listed.values()]
+                _require_one_unit(theirs, [*own.values()], _points(ingest))
             views = [
                 replace(view.at(similarity.pose(view.pose)), unit=similarity.scale)
                 for view in listed.values()
@@ -188,6 +194,39 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         reporter.warn(f"{text}: large; {hint}")
     else:
         reporter.info(text)
+
+
+def _points(ingest: Path) -> ArrayF64:  # [P, 3]
+    """Return the sparse points of a run; none if it lacks their table."""
+    try:
+        return load_points(ingest).xyz
+    except StoreError:
+        return np.zeros((0, 3))
+
+
+def _require_one_unit(theirs: Sequence[Pose], ours: Sequence[Pose], points: ArrayF64) -> None:
+    """Raise InputError if the references are far outside the scene, or all at one place of it.
+
+    ``points`` [P, 3] are the scene's, in the world of both.
+    """
+    if not ours:
+        return
+    away, own = (np.stack([pose.centre for pose in poses]) for poses in (theirs, ours))
+    middle = own.mean(axis=0)
+    scene = np.concatenate([own, points])
+    reach = float(np.quantile(np.linalg.norm(scene - middle, axis=1), 0.99))
+    distance = float(np.median(np.linalg.norm(away - middle, axis=1)))
+    spreads = [float(np.linalg.norm(centres.std(axis=0))) for centres in (away, own)]
+    fault = ""
+    if distance > MAX_OUTSIDE * reach:
+        times = distance / max(reach, 1e-12)
+        fault = f"the references are {times:.3g} times as far away as the scene reaches"
+    elif len(away) >= 3 and spreads[0] < spreads[1] * MIN_SPREAD:
+        times = spreads[1] / max(spreads[0], 1e-12)
+        fault = f"the references are {times:.3g} times as close together as the frames"
+    if fault:
+        hint = "give their poses in the world and the units of the run's input (metres against millimetres?)"
+        raise InputError(fault, hint=hint)
 
 
 def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Similarity, Alignment]:
