@@ -11,7 +11,7 @@ import numpy as np
 
 from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
-from cleargs.capture.overlay import still_parts, wraps_around
+from cleargs.capture.overlay import without_scene, wraps_around
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
 from cleargs.media.image import (
@@ -74,12 +74,18 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             "the pictures are equirectangular panoramas, which show all directions",
             hint="cut perspective views out of them first (ffmpeg's filter v360 does), and give these",
         )
-    still = still_parts(paths)
-    if still is not None:
+    unused = without_scene(paths)
+    if unused is not None and unused.border.any():
         reporter.warn(
-            f"{(still == 0).mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
+            f"{unused.border.mean():.1%} of the pixels are a border around the picture (bars, a lens hood): "
             "masked in all frames"
         )
+    if unused is not None and unused.still.any():
+        reporter.warn(
+            f"{unused.still.mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
+            "masked in all frames"
+        )
+    still = None if unused is None else unused.mask
     prepared = [_work_frame(frame, path, masks / f"{path.name}.png", still) for frame, path in pairs]
     if any(made.masked for made in prepared):
         for made in prepared:  # COLMAP leaves out an image without a mask if others have one
