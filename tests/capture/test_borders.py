@@ -45,7 +45,7 @@ def blurred(picture: ImageU8) -> Picture:
 
 
 def shaded(picture: ImageU8, light: np.ndarray) -> Picture:
-    """Darken a picture by ``light`` [H, W] in [0, 1]; a pixel with less than a tenth of it does not show the scene."""
+    """Darken a picture by ``light`` [H, W] in [0, 1]. Pixels below a tenth show no scene."""
     return (picture * light[..., None]).astype(np.uint8), light < 0.1
 
 
