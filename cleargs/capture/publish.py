@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics, guessed_camera
+from cleargs.capture.cutouts import resampled, write_cut_out
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import Prediction, SfmOutcome
@@ -19,7 +20,7 @@ from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.capture.undistort import undistorter
 from cleargs.errors import StageError
 from cleargs.files import make_folder, remove
-from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
+from cleargs.media.image import read_grey, read_mask, read_rgb, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.progress import Reporter
 
@@ -57,8 +58,17 @@ def publish(
         for index, (frame, lens) in enumerate(zip(frames, lenses, strict=True)):
             undistortion = undistorters[lens]
             flat.append(undistortion.pinhole)
-            rgb = undistortion.image(read_rgb(work / "images" / frame.image))
-            write_rgb(out / "images" / frame.image, rgb)
+            rgb = read_rgb(work / "images" / frame.image)
+            if frame.cut_out:
+                alpha = read_grey(work / "alphas" / frame.image)
+                rgb, alpha = resampled(rgb, alpha, undistortion.image)
+                if frame.source.mask is not None:  # ignored pixels are not empty
+                    ignored = undistortion.mask(read_mask(work / "masks" / f"{frame.image}.png")) == 0
+                    alpha = np.where(ignored, np.uint8(255), alpha)
+                write_cut_out(out / "images" / frame.image, rgb, alpha)
+            else:
+                rgb = undistortion.image(rgb)
+                write_rgb(out / "images" / frame.image, rgb)
             if frame.masked:
                 mask = read_mask(work / "masks" / f"{frame.image}.png")
                 write_mask(out / "masks" / frame.image, undistortion.mask(mask))

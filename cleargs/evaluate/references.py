@@ -15,9 +15,10 @@ import numpy as np
 from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.capture.capture import SourceFrame
+from cleargs.capture.cutouts import are_cut_outs, over_white
 from cleargs.capture.folders import chosen, name_below_images, natural_key
 from cleargs.capture.layouts.transforms import read_transforms
-from cleargs.capture.prepare import read_image, read_stencil
+from cleargs.capture.prepare import is_as_stored, read_image, read_stencil
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
@@ -25,14 +26,16 @@ from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
-from cleargs.formation.frames import view_of
+from cleargs.formation.frames import has_alpha, view_of
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
+from cleargs.media.image import read_transparency
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.packed import require_images
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
+from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64, ImageU8, MaskBool
 
 T = TypeVar("T")
@@ -71,6 +74,8 @@ class ReferenceView:
     """Length of a unit of the scene, in the units of ``depth``."""
     path: MeasuredPath | None = None
     """Measured motion of the camera; None if none is known."""
+    cut_out: bool = False
+    """True if the image is a cut-out over white: renders are compared over white, empty pixels count."""
 
     @property
     def pose(self) -> Pose:
@@ -299,8 +304,9 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
         if stems[stem] > 1:  # for example the cameras of a rig, in separate folders
             stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
-        path = measured.get(frame.frame_id)
-        views.append(ReferenceView(stem, view.camera, view.load, path=path))
+        path, cut_out = measured.get(frame.frame_id), has_alpha(ingest / frame.image)
+        load = partial(_cut_out, view) if cut_out else view.load
+        views.append(ReferenceView(stem, view.camera, load, path=path, cut_out=cut_out))
     return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 
@@ -343,8 +349,9 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
     names = [name_below_images(entry.name) for entry in entries]
     way_of = cache(partial(undistorter, max_size=sys.maxsize))
-    views = []
-    for entry in chosen(entries, directory / "images", len(entries), names):
+    views, found = [], chosen(entries, directory / "images", len(entries), names)
+    cut_out = are_cut_outs([entry.path for entry in found])
+    for entry in found:
         lens, pose = entry.camera, entry.pose
         assert lens is not None and pose is not None  # asked for with poses=True
         way = way_of(lens)
@@ -353,13 +360,27 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
         stem = stem_of(entry.name)
         depth = directory / "depth" / f"{stem}.exr"
         known = depth if lens.is_pinhole and depth.is_file() else None
-        view = ReferenceView(stem, camera, partial(_load, entry, lens, way), known)
+        load = partial(_load, entry, lens, way, cut_out)
+        view = ReferenceView(stem, camera, load, known, cut_out=cut_out)
         views.append((stem, view.at(pose)))
     return _by_stem(views)
 
 
-def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, MaskBool | None]:
-    image, stencil = read_image(frame), read_stencil(frame)
+def _cut_out(view: TrainingView) -> tuple[ImageU8, MaskBool | None]:
+    """Return a cut-out of a run over white, and its mask, in which empty pixels count."""
+    image, mask = view.load()
+    alpha = None if view.transparency is None else view.transparency()
+    assert alpha is not None and image.dtype == np.uint8
+    return over_white(image, alpha), None if mask is None else mask | (alpha <= 127)
+
+
+def _load(frame: SourceFrame, lens: Lens, way: Undistorter, cut_out: bool) -> tuple[ImageU8, MaskBool | None]:
+    image = read_image(frame)
+    stencil = None if cut_out and frame.mask is None else read_stencil(frame)
+    if cut_out:
+        alpha = read_transparency(frame.path, upright=not is_as_stored(frame))
+        assert alpha is not None  # `are_cut_outs`
+        image = over_white(image, alpha)
     if image.shape[1::-1] != (lens.width, lens.height):
         raise InputError(
             f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels, "
