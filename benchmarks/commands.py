@@ -9,6 +9,7 @@ from benchmarks.comparison.evidence_command import evidence
 from benchmarks.comparison.real_command import real
 from benchmarks.comparison.world_command import world
 from benchmarks.motion_command import motion
+from benchmarks.native_command import native
 from benchmarks.poses_command import poses
 from benchmarks.rva.agree_command import agree
 from benchmarks.rva.check_command import check
@@ -28,7 +29,7 @@ def rva() -> None:
     """Compare evaluators of frames and check them against ground truth."""
 
 
-for command in (splat, train, formation, quality, compare, evidence, real, world, poses, motion):
+for command in (splat, train, formation, quality, compare, evidence, real, world, poses, motion, native):
     benchmarks.add_command(command)
 for command in (agree, check):
     rva.add_command(command)

@@ -18,6 +18,7 @@ from rich.filesize import decimal
 import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder, write_bytes
+from cleargs.formation.frames import camera_of
 from cleargs.manifest import plain_json
 from cleargs.named_views import read_views
 from cleargs.parquet import read_table
@@ -31,7 +32,6 @@ from cleargs.report.frames import (
     MEANINGS,
     SCENES,
     FrameRow,
-    camera_of,
     faults_of,
     load_rows,
     scene_with_models,
