@@ -23,6 +23,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
+from cleargs.named_views import keep_views
 from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import check_outputs
@@ -46,6 +47,14 @@ Examples:
     "--single-file", is_flag=True, help="Also write the report as one HTML file, with everything inside."
 )
 @click.option("-o", "--output", type=FILE, help="File of --single-file.  [default: RUN/NAME-report.html]")
+@click.option(
+    "--view",
+    "views",
+    multiple=True,
+    metavar="NAME=X,Y,Z,X,Y,Z",
+    help="Keep a view of the scene (position, target) in RUN, for the report and `export --for web`. "
+    "The page prints this option. `start` is the first view; NAME= removes one.",
+)
 @open_option("Open the report in the browser.")
 @threads_option
 @store_option
@@ -57,6 +66,7 @@ def report(
     run: Path,
     single_file: bool,
     output: Path | None,
+    views: tuple[str, ...],
     opens: bool,
     threads: int,
     store: Path | None,
@@ -78,6 +88,9 @@ def report(
     from cleargs.report.single_file import write_single_file
 
     settings = read_run_file(run, dag, store=store)
+    if views:
+        require_images(run, "a report with other views")
+        keep_views(settings.folder, views)
     page = page_of(settings.folder)
     if read_pack(run) and page.is_file():
         click.echo("note: this is the report as it was packed; without images no other is possible", err=True)

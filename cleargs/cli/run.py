@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -12,6 +13,7 @@ import click
 from click.core import ParameterSource
 
 import cleargs
+from cleargs.capture.sfm_job import GOOD_SHARE
 from cleargs.capture.sources import whole_capture
 from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
@@ -43,6 +45,7 @@ from cleargs.errors import StageError
 from cleargs.packed import WORKS, read_pack
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.live import stage_at_work
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_text
 from cleargs.pipeline.run_file import RUN_FILE, RUN_LOG, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
@@ -184,7 +187,8 @@ def run(
             check_same_input(settings, dag, opened)
             runner = Runner(dag, settings, opened, threads, reporter)
             if dry_run:
-                print_plans(runner.plan(until, tuple(dag.check(name) for name in force)), as_json)
+                plans = runner.plan(until, tuple(dag.check(name) for name in force))
+                print_plans(plans, as_json, settings.stages(dag))
                 return 0
             log(
                 f"cleargs {cleargs.__version__}, {settings.device}, {threads} threads, store {settings.store}"
@@ -294,7 +298,11 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
         click.echo(as_called(note), err=True)
         return
     with opened_store(settings.store) as opened:
-        print_plans(Planner(dag, settings, opened, usable_cores(), make_reporter()).plan(), as_json)
+        plans = Planner(dag, settings, opened, usable_cores(), make_reporter()).plan()
+    if at_work := stage_at_work(settings.folder, settings.store):
+        name, text = at_work
+        plans = [replace(plan, reasons=(text,)) if plan.stage == name else plan for plan in plans]
+    print_plans(plans, as_json, settings.stages(dag))
 
 
 def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:
@@ -330,12 +338,22 @@ def outcome_lines(outcomes: Sequence[StageOutcome], run: Path, report: Path | No
     return [line for line in lines if not line.endswith(": ")]
 
 
+def _trust(kept_out: Mapping[str, Any] | None) -> str:
+    """Return if frames count as placed, with the figure of the keypoints that took no part in their fit."""
+    if kept_out is None:
+        return "placed"
+    figure = (
+        f"{kept_out['share']:.0%} of kept-out keypoints within 2 px, median {kept_out['median_px']:.2g} px"
+    )
+    return f"{'placed' if kept_out['share'] >= GOOD_SHARE else 'with doubtful cameras'}: {figure}"
+
+
 def _extent(summaries: Summaries) -> str:
     """Return the numbers of placed, reliable and repaired frames, as far as they are known."""
     ingest, consolidate = summaries.get("ingest", {}), summaries.get("consolidate", {})
     words = []
     if "registered" in ingest and "frames" in ingest:
-        words.append(f"{ingest['registered']} of {ingest['frames']} frames placed")
+        words.append(f"{ingest['registered']} of {ingest['frames']} frames {_trust(ingest.get('kept_out'))}")
     if "roles" in summaries.get("rva", {}):
         words.append(f"{summaries['rva']['roles']['strong']} reliable")
     if consolidate.get("repairs"):
@@ -385,14 +403,18 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
     return f"cleargs export {quote(str(run))} -o {quote(f'{run.absolute().name}.sog')}"
 
 
-def print_plans(plans: list[StagePlan], as_json: bool) -> None:
-    """Print the state and cost of each stage, with its reasons, then the cost of all."""
+def print_plans(plans: list[StagePlan], as_json: bool, stages: Sequence[str] = ()) -> None:
+    """Print the state and cost of each stage, with its reasons, then the cost of all.
+
+    ``stages`` are those that have work (none given: all). JSON also has the others.
+    """
     lines, facts = [], []
     for plan in plans:
         first, *others = plan.reasons or ("",)
         cost = cost_text(plan.estimate) if plan.estimate is not None else ""
-        lines.append(f"{plan.stage:<12} {plan.state:<8} {cost:<37} {first}".rstrip())
-        lines += [f"{'':<59} {reason}" for reason in others]
+        if not stages or plan.stage in stages:
+            lines.append(f"{plan.stage:<12} {plan.state:<8} {cost:<37} {first}".rstrip())
+            lines += [f"{'':<59} {reason}" for reason in others]
         figures = ("minutes", "memory_gb", "disk_gb")
         estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}
         known = {"stage": plan.stage, "state": plan.state, "key": plan.key, "reasons": list(plan.reasons)}

@@ -5,13 +5,15 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Similarity
+from cleargs.capture.cameras import Similarity, upright
 from cleargs.capture.model import read_model, transform_model, write_model
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.digest import named_files
@@ -19,10 +21,11 @@ from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_bytes, write_json
 from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
+from cleargs.named_views import NamedView, read_views
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
-from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
+from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.run_results import scene_path
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
@@ -39,18 +42,23 @@ class ExportOptions:
     """Choices of `export_scene`; see ``cleargs export --help``."""
 
     up: str | None = None
+    upright: str | None = None
+    """``FRAME:SIDE`` or ``X,Y,Z``: the side of a picture, or the direction in the run's world, that is up."""
     world: Literal["normalised", "input"] = "normalised"
     metres: str | None = None
     """``A-B=D``: the cameras of frames A and B are D metres apart."""
     sh_degree: int | None = None
     prune: Sequence[str] = ()
     crop: str | None = None
+    drop: Sequence[str] = ()
     cameras: bool = False
     """Write cameras and COLMAP model too."""
     force: bool = False
     """Replace existing files."""
     spz: SpzVersion = 3
     """Version of .spz files."""
+    views: bool = False
+    """Write the named views of the run, if it has some, next to the first file."""
 
 
 def export_scene(
@@ -61,8 +69,8 @@ def export_scene(
     Raises InputError if an option cannot be used, or if a file exists and is not to be replaced.
     """
     kinds = _kinds(outputs, options)
-    if options.up is not None and options.world == "input":
-        raise InputError("--up and --world input exclude each other", hint="give one of them")
+    if (options.up or options.upright) is not None and options.world == "input":
+        raise InputError("--up and --upright exclude --world input", hint="give one of them")
     thresholds = parse_prune(options.prune)
     check_outputs(outputs, installed(), run, force=options.force)
     ingest = run / "ingest"
@@ -89,6 +97,11 @@ def export_scene(
     scene, cropped = _cropped(scene, options)
     for output in outputs if options.cameras else ():
         _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
+    if options.views and (views := read_views(run)):
+        file = outputs[0].with_name(f"{_stem(outputs[0])}.views.json")
+        check_outputs([file], installed(), run, force=options.force)
+        write_json(file, views_json(views, next(iter(cameras.values()))[1], **similarity))
+        messages.append(f"{file}: {len(views)} views")
     axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
     written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {stage}, {axes}")
     return [*messages, *cropped, *written]
@@ -109,11 +122,35 @@ def export_file(file: Path, outputs: Sequence[Path], options: ExportOptions) -> 
     scene = read_scene(file)
     if options.sh_degree is not None:
         scene = padded(scene, options.sh_degree)
-    if options.up is not None:
-        scene = transform_scene(scene, scale=1.0, rotation=np.array(UP[options.up]), translation=np.zeros(3))
+    if (options.up or options.upright) is not None:
+        rotation = np.array(UP[options.up or "-y"])
+        if options.upright is not None:
+            rotation = rotation @ upright(_direction(options.upright, {}))
+        scene = transform_scene(scene, scale=1.0, rotation=rotation, translation=np.zeros(3))
     scene, cropped = _cropped(scene, options)
     written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {file.name}")
     return [*cropped, *written]
+
+
+_SIDES = {"top": (1, -1.0), "bottom": (1, 1.0), "left": (0, -1.0), "right": (0, 1.0)}
+"""Side of a picture -> axis of its camera, and sign."""
+
+
+def _direction(text: str, cameras: Mapping[int, tuple[str, Camera]]) -> NDArray[np.float64]:  # [3]
+    """Return the direction in the run's world that ``--upright`` gives. Raises InputError."""
+    side = re.fullmatch(r"(\d+):(top|bottom|left|right)", text)
+    if side is not None and int(side[1]) in cameras:
+        axis, sign = _SIDES[side[2]]
+        return np.asarray(sign * cameras[int(side[1])][1].world_to_camera[axis, :3])
+    with suppress(ValueError):
+        direction = np.array([float(number) for number in text.split(",")])
+        if direction.shape == (3,) and np.isfinite(direction).all() and np.linalg.norm(direction) > 1e-6:
+            return direction
+    frames = f"; frames with a pose are {min(cameras)} to {max(cameras)}" if cameras else ""
+    raise InputError(
+        f"--upright {text} cannot be used",
+        hint=f"give FRAME:top, left, right or bottom, or a direction X,Y,Z{frames}",
+    )
 
 
 def _kinds(outputs: Sequence[Path], options: ExportOptions) -> list[str]:
@@ -122,12 +159,16 @@ def _kinds(outputs: Sequence[Path], options: ExportOptions) -> list[str]:
     for kind in kinds:
         check_up(kind, options.up)
     parse_crop(options.crop)
+    parse_drop(options.drop)
     return kinds
 
 
 def _cropped(scene: Scene, options: ExportOptions) -> tuple[Scene, list[str]]:
-    """Return the scene in the box of the options, and messages. Raises InputError if nothing is left."""
-    messages = []
+    """Return the scene in the box of the options, and messages. Raises InputError if nothing is left.
+
+    Boxes and spheres are in the coordinates of the file.
+    """
+    scene, messages = drop_spheres(scene, parse_drop(options.drop))
     if (region := parse_crop(options.crop)) is not None:
         scene, message = crop_scene(scene, region)
         messages.append(message)
@@ -165,8 +206,16 @@ def _similarity(
         manifest = linked_manifest(ingest.parent, ingest.name)
         world = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
         similarity = {"scale": world.scale, "rotation": world.rotation.T, "translation": world.origin}
-    elif options.up is not None:
-        similarity = orient_up(next(iter(cameras.values()))[1], options.up)
+    else:
+        stand = np.eye(3) if options.upright is None else upright(_direction(options.upright, cameras))
+        if options.up is not None:
+            first = next(iter(cameras.values()))[1]
+            pose = first.world_to_camera.copy()
+            pose[:3, :3] = pose[:3, :3] @ stand.T
+            similarity = orient_up(replace(first, world_to_camera=pose), options.up)
+            similarity["rotation"] = similarity["rotation"] @ stand
+        elif options.upright is not None:
+            similarity = {"scale": 1.0, "rotation": stand, "translation": np.zeros(3)}
     if options.metres is not None:
         match = re.fullmatch(r"(\d+)-(\d+)=(\d*\.?\d+)", options.metres)
         pair = [int(match[n]) for n in (1, 2)] if match else []
@@ -183,6 +232,32 @@ def _similarity(
         factor = wanted / (apart * similarity["scale"])
         similarity |= {name: factor * similarity[name] for name in ("scale", "translation")}
     return similarity
+
+
+def views_json(
+    views: Sequence[NamedView],
+    camera: Camera,
+    scale: float = 1.0,
+    rotation: NDArray[np.float64] | None = None,
+    translation: NDArray[np.float64] | None = None,
+) -> list[dict[str, Any]]:
+    """Return name, position, target, up and horizontal field of view (degrees, of ``camera``) of each view.
+
+    They are in the world of the file: x -> scale rotation x + translation.
+    """
+    turn = np.eye(3) if rotation is None else rotation
+    shift = np.zeros(3) if translation is None else translation
+    fov = float(np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx)))
+    return [
+        {
+            "name": view.name,
+            "position": (scale * turn @ view.position + shift).tolist(),
+            "target": (scale * turn @ view.target + shift).tolist(),
+            "up": (turn @ [0.0, -1.0, 0.0]).tolist(),
+            "fov": fov,
+        }
+        for view in views
+    ]
 
 
 def _write_sidecars(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
+from cleargs.formation.dust import contributions
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import real_views
 from cleargs.formation.observed import evaluate_views
@@ -24,12 +25,10 @@ from cleargs.parquet import read_table
 from cleargs.progress import Reporter
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.backend import mean_psnr, rasteriser_for
-from cleargs.splat.camera import Camera
-from cleargs.splat.constants import SH_C0
-from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import TrainingView
 
+DROP_HINT = "give sphere:X,Y,Z,R with a radius R above 0"
 PRUNE_HINT = "give opacity:O with O from 0 to 1, or contribution:P with P in pixels"
 CROP_HINT = "give box:X,Y,Z,X,Y,Z with the lower corner first, or percentile:P with P above 0 and up to 100"
 
@@ -57,6 +56,44 @@ def parse_crop(rule: str | None) -> tuple[float, ...] | None:
     if not values or not (all(map(lt, low, high)) if kind == "box" else 0.0 < values[0] <= 100.0):
         raise InputError(f"--crop {rule} is not valid", hint=CROP_HINT)
     return values
+
+
+def parse_drop(rules: Sequence[str]) -> list[tuple[float, ...]]:
+    """Return centre and radius (four numbers) of each sphere. Raises InputError."""
+    spheres = []
+    for rule in rules:
+        _, values = _parsed(rule, sphere=4)
+        if not values or values[3] <= 0.0:
+            raise InputError(f"--drop {rule} is not valid", hint=DROP_HINT)
+        spheres.append(values)
+    return spheres
+
+
+def drop_spheres(scene: Scene, spheres: Iterable[tuple[float, ...]]) -> tuple[Scene, list[str]]:
+    """Return the scene without the Gaussians whose centres are in a sphere of `parse_drop`, and messages."""
+    messages = []
+    for *centre, radius in spheres:
+        away = torch.linalg.vector_norm(scene.gaussians.means - torch.tensor(centre), dim=1) > radius
+        if away.all():
+            raise InputError(
+                f"no Gaussian is in the sphere {_numbers((*centre, radius))}", hint=extent_text(scene)
+            )
+        messages.append(f"dropped {int((~away).sum())} Gaussians in the sphere {_numbers((*centre, radius))}")
+        scene = replace(scene, gaussians=scene.gaussians.select(away))
+    return scene, messages
+
+
+def extent_text(scene: Scene) -> str:
+    """Return the box of all centres, and of their 1 to 99 % along each axis, in the form of ``--crop``."""
+    means = scene.gaussians.means
+    if not len(means):
+        return "the scene is empty"
+    whole, most = (means.amin(0).tolist() + means.amax(0).tolist(), np.concatenate(central_box(means, 98.0)))
+    return f"the scene is in box:{_numbers(whole)}, its 1 to 99 % in box:{_numbers(most)}"
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ",".join(f"{value:.4g}" for value in values)
 
 
 def _parsed(rule: str, **counts: int) -> tuple[str, tuple[float, ...]]:
@@ -118,31 +155,12 @@ def crop_scene(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
     else:
         low, high = np.array(region[:3]), np.array(region[3:])
     smaller = scene.gaussians.select(inside(means, low, high))
-    box = ",".join(f"{value:.4g}" for value in (*low, *high))
+    box = _numbers((*low, *high))
+    if not smaller.num:
+        raise InputError(f"no Gaussian is left in the box {box}", hint=extent_text(scene))
     return replace(scene, gaussians=smaller), (
         f"cropped to the box {box}: {means.shape[0] - smaller.num} of {means.shape[0]} Gaussians are outside"
     )
-
-
-def contributions(scene: Scene, cameras: Iterable[Camera], advance: Callable[[], None]) -> Tensor:  # [N]
-    """Return the largest contribution of each Gaussian to one picture, in pixels.
-
-    The contribution is the sum over pixels of the blending weight (opacity times the transmittance in front).
-    A pixel's colour is the sum of weight times colour, so this is the gradient of the sum of the picture with
-    respect to the colour of the Gaussian. All colours are set to grey, because a colour that is clamped at 0
-    has no gradient. ``advance`` is called after each camera.
-    """
-    gaussians = scene.gaussians.detach()
-    grey = Gaussians(**{**gaussians.tensors(), "sh": torch.zeros_like(gaussians.sh[:, :1])})
-    engine = rasteriser_for(gaussians.device)
-    largest = torch.zeros(gaussians.num, device=gaussians.device)
-    for camera in cameras:
-        image = engine.forward(grey, camera, antialias=scene.antialias).image
-        red_gradient = torch.zeros_like(image)
-        red_gradient[..., 0] = 1.0 / SH_C0
-        torch.maximum(largest, engine.backward(red_gradient).sh[:, 0, 0], out=largest)
-        advance()
-    return largest
 
 
 def inside(means: Tensor, low: NDArray[np.float64], high: NDArray[np.float64]) -> Tensor:  # [N] bool
