@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
-from cleargs.formation.frames import view_of
+from cleargs.formation.frames import camera_of
 from cleargs.formation.measured import load_paths
 from cleargs.formation.motion import TWIST, grid_basis
 from cleargs.types import ArrayF64
@@ -59,15 +59,15 @@ def compare(capture: Path, run: Path) -> Comparison:
     paths = load_paths(run / "ingest")
     frames = [frame for frame in load_frames(run / "ingest") if frame.registered]
     numbers = {frame.frame_id: _number(frame.name) for frame in frames}
-    views = {frame.frame_id: view_of(frame, run / "ingest", 1.0) for frame in frames}
-    poses = {key: view.camera.world_to_camera for key, view in views.items()}
+    cameras = {frame.frame_id: camera_of(frame) for frame in frames}
+    poses = {key: camera.world_to_camera for key, camera in cameras.items()}
     known = [key for key in sorted(paths) if key - 1 in poses and key + 1 in poses]
     if not known:
         raise InputError(f"{run} has no measured motion", hint="run it on the video of the capture")
     theirs = np.stack([_centre(np.reshape(truth[numbers[key]]["world_to_camera"], (3, 4))) for key in poses])
     ours = np.stack([_centre(pose[:3]) for pose in poses.values()])
     scale = _spread(ours) / _spread(theirs)
-    camera = views[known[0]].camera
+    camera = cameras[known[0]]
     basis = grid_basis(camera, GRID).reshape(TWIST, 2, -1)
 
     def flow(twist: ArrayF64, key: int) -> ArrayF64:  # [P, 2] px per frame of the video

@@ -16,7 +16,7 @@ _HOMES = {
     "make_capture": "synth.synthetic_capture",
     "Camera": "splat.camera",
     "CleargsError": "errors",
-    "G0Config": "stages.g0",
+    "G0Config": "stages.config",
     "Gaussians": "splat.gaussians",
     "Scene": "splat.scene",
     "TrainConfig": "splat.config",

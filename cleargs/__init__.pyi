@@ -25,7 +25,7 @@ from cleargs.splat.scene import Scene as Scene
 from cleargs.splat.views import TrainingView as TrainingView
 
 # An installed package has cleargs.stages. In a checkout it is the folder stages/, which mypy does not search.
-from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]
+from cleargs.stages.config import G0Config as G0Config  # type: ignore[import-not-found]
 from cleargs.synth.synthetic_capture import make_capture as make_capture
 
 View = TrainingView  # former name

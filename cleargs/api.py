@@ -19,7 +19,7 @@ from cleargs.packed import require_images
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.progress import log_reporter
-from cleargs.run_results import SCENE, Run, open_prepared, scene_stage
+from cleargs.run_results import SCENE, Run, open_prepared, open_run, scene_stage
 from cleargs.splat.config import Quality
 
 if TYPE_CHECKING:
@@ -188,8 +188,8 @@ def evaluate_scene(
     """Compare renders of a scene with sharp reference images.
 
     Args:
-        scene: A run, a scene or a PLY file. The scene of a run is transformed to the coordinates of its
-            input. Other scenes must be in the coordinates of the reference.
+        scene: A run or its folder, a scene or a PLY file. The scene of a run is transformed to the
+            coordinates of its input. Other scenes must be in the coordinates of the reference.
         reference: A folder with ``images/`` and ``transforms.json`` (default: the held-out frames of the
             run).
         stage: The stage of the run whose scene is compared (default: the last one that has a scene).
@@ -213,6 +213,8 @@ def evaluate_scene(
     from cleargs.splat.scene import Scene
 
     directory, reporter = None if reference is None else Path(reference), reporter_of(progress)
+    if isinstance(scene, str | Path) and Path(scene).is_dir():
+        scene = open_run(scene)
     run = scene.folder if isinstance(scene, Run) else None
     compared = reference_of(run, directory, reporter=reporter)
     with tempfile.TemporaryDirectory() as folder:

@@ -235,7 +235,7 @@ class Prepared:
 
     def cameras(self) -> dict[int, Camera]:
         """Return frame_id -> camera for all frames with a pose, including held-out frames."""
-        from cleargs.formation.frames import view_of
+        from cleargs.formation.frames import camera_of
 
         posed = (frame for frame in self.frames if frame.registered)
-        return {frame.frame_id: view_of(frame, self.folder, 1.0).camera for frame in posed}
+        return {frame.frame_id: camera_of(frame) for frame in posed}

@@ -1,9 +1,9 @@
-"""Settings that rivr and consolidate share, for trainings that continue from a scene."""
+"""Settings of the stages that train: of G0, and those that rivr and consolidate share."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -38,6 +38,36 @@ def other_libraries(device: Device, config: object) -> Mapping[str, str]:
 
     kernels = {"triton": installed_version("triton")} if device == "cuda" else {}
     return {"onnxruntime": runtime_version(device), **kernels}
+
+
+class G0Config(TrainConfig):
+    """The first scene, from the sparse points and the frames that RVA keeps."""
+
+    end: float = Field(
+        G0_END,
+        gt=0,
+        le=1,
+        description="end of this training in the schedule, as a fraction; RIVR and the consolidation "
+        "continue from there. 1: for a scene that no other training continues",
+    )
+    sh_degree: int | None = Field(
+        None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
+    )
+    exposure: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="one colour affine per frame; auto = on if the brightness of the frames, measured at "
+        "the sparse points, spreads by more than 5 %",
+    )
+    antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
+    min_points: int = Field(
+        10_000,
+        ge=1,
+        le=5_000_000,
+        description="fewest Gaussians to start from, within the budget; points are added to reach it",
+    )
+
+    exposure_threshold: ClassVar[float] = 0.05
+    """``auto`` is on if the `gain_spread` of the frames is above this. With a fixed exposure it is below."""
 
 
 class DistilConfig(FrozenModel):

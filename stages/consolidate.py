@@ -36,7 +36,7 @@ class ConsolidateConfig(FrozenModel):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 46
+VERSION = 47
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {

@@ -4,46 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
-
-from pydantic import Field
+from typing import Any
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
-from cleargs.splat.config import TrainConfig
 from cleargs.types import Device
 
-from .config import G0_END, TRAINED
-
-
-class G0Config(TrainConfig):
-    """The first scene, from the sparse points and the frames that RVA keeps."""
-
-    end: float = Field(
-        G0_END,
-        gt=0,
-        le=1,
-        description="end of this training in the schedule, as a fraction; RIVR and the consolidation "
-        "continue from there. 1: for a scene that no other training continues",
-    )
-    sh_degree: int | None = Field(
-        None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
-    )
-    exposure: Literal["auto", "on", "off"] = Field(
-        "auto",
-        description="one colour affine per frame; auto = on if the brightness of the frames, measured at "
-        "the sparse points, spreads by more than 5 %",
-    )
-    antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
-    min_points: int = Field(
-        10_000,
-        ge=1,
-        le=5_000_000,
-        description="fewest Gaussians to start from, within the budget; points are added to reach it",
-    )
-
-    exposure_threshold: ClassVar[float] = 0.05
-    """``auto`` is on if the `gain_spread` of the frames is above this. With a fixed exposure it is below."""
+from .config import TRAINED, G0Config
 
 
 def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
@@ -51,7 +18,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 43
+VERSION = 44
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -43,17 +43,19 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports(path: Path, known: Mapping[str, Path]) -> set[str]:
-    """Modules of ClearGS that a file imports, also inside functions and for type checking."""
+def imports(module: str, text: str, known: Collection[str]) -> set[str]:
+    """Modules of ClearGS that ``module`` imports, also inside functions, for type checking and relatively."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
+        elif isinstance(node, ast.ImportFrom):
+            above = module.split(".")[: -node.level] if node.level else []
+            source = ".".join([*above, *([node.module] if node.module else [])])
             for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                names.add(inner if inner in known else node.module)
-    return names & known.keys()
+                inner = f"{source}.{alias.name}"
+                names.add(inner if inner in known else source)
+    return names & set(known)
 
 
 def package_of(module: str) -> str:
@@ -105,7 +107,13 @@ def cycles(graph: Mapping[str, set[str]]) -> list[list[str]]:
 def graph() -> dict[str, set[str]]:
     """Module -> modules that it imports."""
     known = modules()
-    return {name: imports(path, known) - {name} for name, path in known.items()}
+    return {name: imports(name, path.read_text("utf-8"), known) - {name} for name, path in known.items()}
+
+
+def test_relative_imports_are_seen() -> None:
+    known = ("cleargs.stages", "cleargs.stages.cost", "cleargs.stages.g0", "cleargs.errors")
+    text = "from .cost import expected\nfrom . import cost\nfrom ..errors import StoreError"
+    assert imports("cleargs.stages.g0", text, known) == {"cleargs.stages.cost", "cleargs.errors"}
 
 
 def test_imports_point_downwards() -> None:

@@ -1,7 +1,8 @@
 """Check that a stage whose source changed has a new VERSION, by the lock file ``stages/versions.lock.json``.
 
 The source of a stage is its module and all ClearGS modules that it imports, directly or indirectly, also
-inside functions. It is compared as syntax trees without docstrings, comments and layout. ::
+inside functions. It is compared as syntax trees without docstrings, comments and layout. A stage's function
+``estimate`` is left out with its imports, because no result depends on an estimate. ::
 
     python -m tools.versions                                list changes
     python -m tools.versions --update                       after an increase of VERSION
@@ -29,6 +30,9 @@ LOCK_NAME = "versions.lock.json"
 
 CLI_PACKAGE = "cleargs.cli"
 """Package of the command line; it does not affect results, so it is not part of any source."""
+
+ESTIMATE = "estimate"
+"""Function of a stage that returns its expected cost. No result depends on it."""
 
 Lock = dict[str, dict[str, Any]]
 """Stage -> {"version", "digest", "modules": {module: digest}, "unchanged_because": reason or absent}."""
@@ -62,6 +66,8 @@ class Sources:
             if file is None or name in digests or f"{name}.".startswith(f"{CLI_PACKAGE}."):
                 continue
             tree = ast.parse(file.read_bytes())
+            if name == module:
+                tree.body = [node for node in tree.body if getattr(node, "name", None) != ESTIMATE]
             digests[name] = hashlib.sha256("\n".join(_tokens(tree)).encode()).hexdigest()
             package = name if file.name == "__init__.py" else name.rpartition(".")[0]
             waiting += _named_modules(tree, package)

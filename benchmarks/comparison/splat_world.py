@@ -13,7 +13,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError, StoreError
-from cleargs.formation.frames import view_of
+from cleargs.formation.frames import camera_of
 from cleargs.media.colour import linear_from_srgb
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
@@ -191,7 +191,7 @@ def _read_cameras(source: Path) -> list[tuple[Lens, ArrayF64]]:
     """
     ingest = source / "ingest"
     if (ingest / "frames.parquet").is_file():
-        cameras = [view_of(frame, ingest, 0.0).camera for frame in load_frames(ingest) if frame.registered]
+        cameras = [camera_of(frame) for frame in load_frames(ingest) if frame.registered]
         return [
             (
                 Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),

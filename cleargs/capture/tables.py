@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from cleargs.capture.cameras import Pose
 from cleargs.capture.folders import is_inside
 from cleargs.errors import StoreError
 from cleargs.parquet import column, read_table, schema_of
@@ -54,6 +55,15 @@ class Frame:
     placed: Annotated[str | None, "method by which the pose was found, or the reason why there is none"]
     mask: str | None
     """Path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None. Not in the table."""
+
+    @property
+    def pose(self) -> Pose:
+        """Pose in the normalised world. Raises ValueError if the frame has none."""
+        numbers = self.qw, self.qx, self.qy, self.qz, self.tx, self.ty, self.tz
+        known = np.array([number for number in numbers if number is not None], np.float64)
+        if not self.registered or len(known) < len(numbers) or np.isnan(known).any():
+            raise ValueError(f"frame {self.frame_id} has no pose")
+        return Pose.from_quaternion(known[:4], known[4:])
 
 
 FRAMES = schema_of(Frame)

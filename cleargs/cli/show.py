@@ -231,7 +231,8 @@ def _show_frame(
 
     Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
-    from cleargs.report.frames import MEANINGS, camera_of, load_rows, worst_cue
+    from cleargs.formation.frames import camera_of
+    from cleargs.report.frames import MEANINGS, load_rows, worst_cue
     from cleargs.rivr.tables import REPAIRS
 
     if "ingest" not in done:
@@ -267,9 +268,10 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
     They are the raw frame, the layers of its latest round or image formation, and the last scene at its pose.
     """
+    from cleargs.formation.frames import camera_of
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
-    from cleargs.report.frames import camera_of, last_scene, scene_with_models
+    from cleargs.report.frames import last_scene, scene_with_models
     from cleargs.report.pictures import LAYERS, formed_layers, layers_of
     from cleargs.splat.ply import read_ply
     from cleargs.splat.render import Viewer

@@ -122,7 +122,7 @@ def reference_of(
         found = _held_out(ingest, frames)
     else:
         listed = _listed(directory)
-        own = _by_stem((stem_of(frame.name), _run_pose(frame)) for frame in frames if frame.registered)
+        own = _by_stem((stem_of(frame.name), frame.pose) for frame in frames if frame.registered)
         hint = f"name the references like the frames (cleargs show {run} ingest)"
         alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
         if poses == "given":
@@ -188,12 +188,6 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         reporter.warn(f"{text}: large; {hint}")
     else:
         reporter.info(text)
-
-
-def _run_pose(frame: Frame) -> Pose:
-    values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
-    numbers = np.array([value for value in values if value is not None], np.float64)
-    return Pose.from_quaternion(numbers[:4], numbers[4:])
 
 
 def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Similarity, Alignment]:
@@ -290,7 +284,7 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
     count = 0
     for view in reference.views:
         if view.name in own:
-            there, pose = view.pose, _run_pose(own[view.name])
+            there, pose = view.pose, own[view.name].pose
             apart = rotation_between(there.rotation, pose.rotation)
             if np.linalg.norm(there.centre - pose.centre) < SAME_VIEW and apart < np.degrees(SAME_VIEW):
                 count += 1

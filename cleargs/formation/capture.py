@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
-from cleargs.formation.frame import FrameFormation, Shot, Terms, filmed_as, fit_motion, packed, unpacked
+from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
+from cleargs.formation.look import Shot, Terms, fit_motion
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import Movement
 from cleargs.formation.observed import FormedView

@@ -21,21 +21,16 @@ GIVEN = "given"
 their points by at most ``ingest.refine_above`` px (median). Ingest adjusts or estimates all other poses."""
 
 
+def camera_of(frame: Frame) -> Camera:
+    """Return the camera of a registered frame. Raises ValueError if it has no pose."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = frame.pose.rotation, frame.pose.translation
+    return Camera(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy, pose)
+
+
 def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
     """Return the view of a registered frame, whose files are in ``folder`` (the ingest folder)."""
-    quaternion = np.array([frame.qw, frame.qx, frame.qy, frame.qz], np.float64)
-    translation = np.array([frame.tx, frame.ty, frame.tz], np.float64)
-    if not frame.registered or np.isnan([*quaternion, *translation]).any():
-        raise ValueError(f"frame {frame.frame_id} has no pose")
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = translation
-    camera = Camera(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy, pose)
+    camera = camera_of(frame)
     image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
     estimated = frame.placed not in (None, GIVEN)
     time = float(frame.frame_id) if frame.time_s is None else frame.time_s

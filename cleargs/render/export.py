@@ -17,7 +17,7 @@ from cleargs.capture.tables import load_frames, load_points
 from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_bytes, write_json
-from cleargs.formation.frames import view_of
+from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
@@ -67,7 +67,7 @@ def export_scene(
     check_outputs(outputs, installed(), run, force=options.force)
     ingest = run / "ingest"
     posed = [frame for frame in load_frames(ingest) if frame.registered]
-    cameras = {frame.frame_id: (frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed}
+    cameras = {frame.frame_id: (frame.name, camera_of(frame)) for frame in posed}
     similarity = _similarity(ingest, cameras, options)
     scene, messages = read_ply(scene_path(run, stage)), []
     if thresholds:

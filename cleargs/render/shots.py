@@ -13,7 +13,7 @@ import numpy as np
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
-from cleargs.formation.frames import view_of
+from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
@@ -135,7 +135,7 @@ def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
     frames = [frame for frame in listed if frame.registered]
     if not frames:
         raise InputError("no frame of this capture has a pose", hint="see cleargs show RUN ingest")
-    own = [view_of(frame, ingest, 0.0).camera for frame in frames]
+    own = [camera_of(frame) for frame in frames]
     lens = own[len(own) // 2]
     count = max(2, round(options.fps * (options.seconds or SECONDS)))
     filmed: list[Frame] = []

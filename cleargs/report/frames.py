@@ -13,14 +13,12 @@ import numpy as np
 from cleargs.capture.measuring import MOTION
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import read_exposure
-from cleargs.formation.frames import view_of
 from cleargs.formation.movement import read_movement
 from cleargs.formation.table import FORMATION
 from cleargs.parquet import read_any_table, read_table
 from cleargs.rivr.distillation import TrainedScene
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
-from cleargs.splat.camera import Camera
 from cleargs.splat.tables import TRAIN
 from cleargs.types import ArrayF64, MaskBool
 
@@ -236,8 +234,3 @@ def _last_psnr(tables: Sequence[Path]) -> dict[int, float]:
         full = max(width for width, _ in of_frame)
         found[frame_id] = float(np.median([psnr for width, psnr in of_frame if width == full][-LAST_STEPS:]))
     return found
-
-
-def camera_of(frame: Frame) -> Camera:
-    """Return the camera of a frame with a pose."""
-    return view_of(frame, Path(), 0.0).camera

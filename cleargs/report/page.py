@@ -18,6 +18,7 @@ from rich.filesize import decimal
 import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder, write_bytes
+from cleargs.formation.frames import camera_of
 from cleargs.manifest import plain_json
 from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config
@@ -30,7 +31,6 @@ from cleargs.report.frames import (
     MEANINGS,
     SCENES,
     FrameRow,
-    camera_of,
     faults_of,
     load_rows,
     scene_with_models,

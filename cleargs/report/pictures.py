@@ -14,12 +14,12 @@ import numpy as np
 from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.metrics import psnr as psnr_of
 from cleargs.formation.frame import from_row
-from cleargs.formation.frames import view_of
+from cleargs.formation.frames import camera_of, view_of
 from cleargs.formation.motion import pixel_paths
 from cleargs.formation.movement import still_pixels
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_rgb, reduced, to_uint8
-from cleargs.report.frames import HELD_OUT, FrameRow, camera_of
+from cleargs.report.frames import HELD_OUT, FrameRow
 from cleargs.rivr.distillation import TrainedScene
 from cleargs.splat.render import Viewer
 from cleargs.types import ImageU8

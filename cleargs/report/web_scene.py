@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from cleargs.report.frames import FrameRow, camera_of
+from cleargs.formation.frames import camera_of
+from cleargs.report.frames import FrameRow
 from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES

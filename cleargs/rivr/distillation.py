@@ -20,7 +20,8 @@ from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.deblur import deblur
 from cleargs.formation.exposure import read_exposure, write_exposure
-from cleargs.formation.frame import FrameFormation, Shot, Terms, fit_motion
+from cleargs.formation.frame import FrameFormation
+from cleargs.formation.look import Shot, Terms, fit_motion
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import TOLERANCE, read_movement, still_pixels, write_movement
 from cleargs.formation.observed import (

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from scipy.spatial.transform import Rotation
 
 from cleargs.capture.tables import Frame
 from cleargs.rva import allocation, geometry
@@ -145,11 +144,10 @@ def poses_from(frames: Sequence[Frame]) -> Poses:
     rotations = np.tile(np.eye(3), (len(frames), 1, 1))
     translations = np.zeros((len(frames), 3))
     registered = np.array([frame.registered for frame in frames], dtype=bool)
-    posed = [frame for frame in frames if frame.registered]
-    if posed:
-        quaternions = np.array([(f.qx, f.qy, f.qz, f.qw) for f in posed], dtype=np.float64)  # scipy: w last
-        rotations[registered] = Rotation.from_quat(quaternions).as_matrix()
-        translations[registered] = np.array([(f.tx, f.ty, f.tz) for f in posed], dtype=np.float64)
+    for number, frame in enumerate(frames):
+        if frame.registered:
+            pose = frame.pose
+            rotations[number], translations[number] = pose.rotation, pose.translation
     return Poses(rotations, translations, registered)
 
 

@@ -201,7 +201,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> list[FramePair]:
         pairs.append(pair)
         return search(pair, **settings)
 
-    monkeypatch.setattr("cleargs.formation.frame.search", counted)
+    monkeypatch.setattr("cleargs.formation.look.search", counted)
     return pairs
 
 
@@ -267,7 +267,7 @@ def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
 ) -> None:
     """All frames have noise. The test is replaced by one that sees a blur of 7 px across in each."""
     found = BlurEvidence(line_gain=0.2, line=49.0 / 12.0, angle=0.0, disc_gain=0.0, disc=0.0)
-    monkeypatch.setattr("cleargs.formation.frame.blur_evidence", lambda *_: found)
+    monkeypatch.setattr("cleargs.formation.look.blur_evidence", lambda *_: found)
     rng = np.random.default_rng(0)
     seen = []
     for view in views():

@@ -53,7 +53,7 @@ def test_a_measured_blur_needs_no_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
 ) -> None:
     """Only its exposure time is unknown."""
-    monkeypatch.setattr("cleargs.formation.frame.search", None)
+    monkeypatch.setattr("cleargs.formation.look.search", None)
     seen = filmed({BLURRED: blurred()})
     formation = CaptureFormation(seen, LOOK, measured={k: measured(error=error) for k in range(FRAMES)})
     run(tmp_path, seen, formation)

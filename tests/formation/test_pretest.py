@@ -10,7 +10,7 @@ import pytest
 from helpers.observations import picture
 
 from cleargs.formation.comparison import luminance
-from cleargs.formation.frame import EVIDENCE
+from cleargs.formation.look import EVIDENCE
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
 from cleargs.splat.backend import set_threads
 from cleargs.splat.kernels.cpu import backend as cpu

@@ -14,8 +14,8 @@ from report_run import COUNT, HOSTILE, FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.digest import DigestMemo
+from cleargs.formation.frames import camera_of
 from cleargs.pipeline.store import Store
-from cleargs.report.frames import camera_of
 from cleargs.report.page import write_report
 from cleargs.report.single_file import write_single_file
 from cleargs.splat.render import Viewer

@@ -16,7 +16,7 @@ from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
-from cleargs.report.frames import camera_of
+from cleargs.formation.frames import camera_of
 from cleargs.report.web_scene import viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
 from cleargs.splat.render import Viewer

@@ -32,8 +32,8 @@ from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import save_state
 from cleargs.splat.types import Moments
+from cleargs.stages.config import G0Config
 from cleargs.stages.consolidate import ConsolidateConfig
-from cleargs.stages.g0 import G0Config
 from cleargs.stages.rivr import RivrConfig
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0

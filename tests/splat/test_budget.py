@@ -13,8 +13,7 @@ from cleargs.pipeline.dag import installed
 from cleargs.splat.budget import gaussians_by_step, resolve_config, training_cost
 from cleargs.splat.config import Quality, TrainConfig, budget_from_pixels, steps_from_frames
 from cleargs.splat.trainer import Trainer
-from cleargs.stages.config import DistilConfig
-from cleargs.stages.g0 import G0Config
+from cleargs.stages.config import DistilConfig, G0Config
 
 
 def test_steps_follow_the_frames_within_bounds() -> None:

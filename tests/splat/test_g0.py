@@ -31,8 +31,7 @@ from cleargs.splat.ply import read_ply
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
 from cleargs.stages import cost, g0
-from cleargs.stages.config import DistilConfig
-from cleargs.stages.g0 import G0Config
+from cleargs.stages.config import DistilConfig, G0Config
 
 ACTIVE = {0: 0.9, 1: 0.97, 2: 1.0, 5: 0.12}
 SUPPRESSED, HELD_OUT, UNREGISTERED = 3, 4, 6

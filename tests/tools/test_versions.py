@@ -47,7 +47,16 @@ class PackageTree:
         self.root = root
         self.version = 1
         self.write(
-            "stages/one.py", "VERSION = 1\ndef run(c):\n    from cleargs.package.work import go\n    go()\n"
+            "stages/one.py",
+            """
+            VERSION = 1
+            def estimate(c):
+                from cleargs.other import W
+                return W
+            def run(c):
+                from cleargs.package.work import go
+                go()
+            """,
         )
         self.write("cleargs/__init__.py", '"""Top."""\n')
         self.write("cleargs/package/__init__.py", "")
@@ -71,6 +80,13 @@ class PackageTree:
 @pytest.fixture
 def tree(tmp_path: Path) -> PackageTree:
     return PackageTree(tmp_path)
+
+
+def test_estimates_are_no_part_of_the_source(tree: PackageTree) -> None:
+    before = tree.lock()
+    stage = tree.root / "stages" / "one.py"
+    stage.write_text(stage.read_text().replace("return W", "return 2 * W"))
+    assert violations(before, tree.lock()) == []
 
 
 def test_source_is_all_that_is_imported(tree: PackageTree) -> None:

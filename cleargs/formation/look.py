@@ -1,0 +1,366 @@
+"""Estimation of a frame's formation with a scene.
+
+The *misfit* of a frame is its mean difference from the render (`comparison`). *Evidence* is the share of the
+squared error that further blur would explain (`pretest`). A *search* fits all models from scratch (`search`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cleargs.formation.comparison import (
+    MIN_MISFIT,
+    FramePair,
+    MotionFit,
+    explained_share,
+    finest_level,
+    luminance,
+)
+from cleargs.formation.frame import FrameFormation, margin_for, reach_of
+from cleargs.formation.measured import MeasuredPath
+from cleargs.formation.motion import FrameMotion, Model, widened
+from cleargs.formation.pretest import BlurEvidence, blur_evidence
+from cleargs.formation.search import blur_along, corrected, measured_fits, named, preferred, refine, search
+from cleargs.formation.warp import Warp, displacement_fields, path_lengths
+from cleargs.splat.backend import backend_for
+from cleargs.splat.camera import Camera
+from cleargs.splat.config import FormationConfig
+from cleargs.splat.formation import Renderer
+from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
+from cleargs.splat.types import Render
+from cleargs.types import ArrayF64
+
+EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
+"""Evidence of blur above which a frame is searched. The second value is for frames that RVA doubts. Both are
+from tuning captures (docs/experiments/formation.md)."""
+WORSE = -0.03
+"""Threshold of a check before a frame without a model is searched in a sharp capture: half of the blur that
+the test found must not raise the misfit by 3 % or more. Wrong geometry can look like blur in the test, but
+blurring the render then makes it less like the frame (docs/experiments/formation.md)."""
+GROWN_EVIDENCE = 1.25
+"""Factor by which the evidence must have grown since the last search before a frame is searched again."""
+SEARCHED_SHARE = 0.05
+"""Margin of a search, as a share of the longer side."""
+
+EXPOSURES = np.geomspace(1 / 16, 3.0, 18)
+"""Exposure times that are tried with a measured motion, in frames of the video."""
+
+NEARER = np.array([0.85, 0.92, 1.0, 1.08, 1.17])
+"""Exposure times that are tried around the best of these, as factors."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A raw frame at the size of a training step, and the scene that it shows."""
+
+    camera: Camera
+    """The camera of the frame, reduced by ``factor``."""
+    affine: Tensor | None  # [3, 4] colour of the frame
+    target: Tensor  # [H, W, 3] sRGB
+    mask: Tensor | None  # [H, W]
+    render: Renderer
+    """Renders the scene with depth."""
+    factor: float = 1.0
+    """Size of ``camera`` over that of the frame."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Facts about a frame and its capture on which a look depends."""
+
+    pose: bool = False
+    """Correct the pose together with a motion."""
+    doubted: bool = False
+    """RVA doubts the frame, so less evidence is needed for a search."""
+    shutter: Literal["still", "tested", "rolls"] = "still"
+    """still: no model with a skew; tested: none, but `FrameFormation.skew_gain` is measured; rolls: all."""
+    curve: bool = False
+    """Try a higher order of the path, and search a frame with a curved path or a rolling shutter."""
+    sparing: bool = False
+    """Also the first time, search only for a blur that the test and `_Look._resembles` admit."""
+    exposure_s: float = 0.0
+    """Exposure time of the frames around this one, s; 0: it is not known."""
+    measured: MeasuredPath | None = None
+    """Motion that ingest measured. Its skew replaces all others, and its blur the first search."""
+
+
+class Reason(Enum):
+    """Reason for a search."""
+
+    FIRST = "a scene that is still soft hides short blurs from the test"
+    SHUTTER = "a skew must be found or tested, which the test cannot see"
+    MODEL = "the model of the frame is no longer admitted"
+    CURVE = "a descent with many unknowns that began in a soft scene can stay in a wrong path"
+    BLUR = "the test finds blur that the model does not explain"
+
+
+def fit_motion(
+    frame: FrameFormation,  # the formation so far, whose model remains a candidate
+    config: FormationConfig,
+    shot: Shot,
+    terms: Terms,
+) -> FrameFormation:
+    """Estimate how a raw frame was taken, from the scene that it shows.
+
+    The known formation is refined, or the measured motion is followed. The frame is searched only for a
+    `Reason`.
+    """
+    look = _Look(frame, config, shot, terms)
+    found = look.followed()
+    best = look.accepted(found[1:] or found, found[0])
+    evidence = look.unexplained(best)
+    if look.reason(found, best, evidence) is None:
+        return look.described(best, min(frame.evidence, evidence.gain))
+    found = look.searched(found, best, evidence)
+    best = look.accepted(found, found[0])
+    return look.described(best, look.unexplained(best).gain)
+
+
+class _Look:
+    """One look at a frame, with the present scene."""
+
+    def __init__(self, frame: FrameFormation, config: FormationConfig, shot: Shot, terms: Terms) -> None:
+        self._frame, self._config, self._shot, self._terms = frame, config, shot, terms
+        self._show(margin_for(frame.reach_px * shot.factor, shot.camera))
+
+    def _show(self, margin: int) -> None:
+        """Render the scene with a margin."""
+        shot, self._margin = self._shot, margin
+        self._rendered = shot.render(widened(shot.camera, margin))
+        self._pair = frame_pair(self._rendered, shot.affine, shot.target, shot.mask, shot.camera, margin)
+
+    @property
+    def _known(self) -> FrameMotion:
+        """The known motion, at the size of this look."""
+        return _scaled(self._frame.motion, self._shot.factor)
+
+    @property
+    def _held(self) -> FrameMotion | None:
+        """The measured skew, which all models have; None if no readout was measured."""
+        measured = self._terms.measured
+        if measured is None or not measured.rolls:
+            return None
+        return measured.read(self._shot.camera, finest_level(self._pair).median)
+
+    def followed(self) -> list[MotionFit]:
+        """Return the fit without blur and defocus, then those of the known or of the measured motion."""
+        frame, terms, held = self._frame, self._terms, self._held
+        if terms.measured is not None and not frame.searched:
+            return [self._resting(), *self._measured(terms.measured)]
+        if held is None:
+            return refine(self._pair, frame.model, self._known, pose=terms.pose, curve=terms.curve)
+        model: Model = "defocus" if frame.model == "defocus" else "blur"
+        found = refine(self._pair, model, self._known, pose=terms.pose, curve=terms.curve)
+        return [self._resting(), *(replace(fit, model=named(fit.model, fit.motion)) for fit in found[1:])]
+
+    def _resting(self) -> MotionFit:
+        """Return the fit without blur and defocus."""
+        level, held = finest_level(self._pair), self._held
+        if held is None:
+            return level.evaluate("none", FrameMotion(median_depth=level.median))
+        return level.evaluate("skew", held)
+
+    def _measured(self, measured: MeasuredPath) -> list[MotionFit]:
+        """Return fits of the measured motion, by the known exposure time or by the best of several."""
+        known = self._known
+        found: list[MotionFit] = []
+        if known.exposure_s > 0.0:
+            path = self._exposed(measured, known.exposure_s)
+            if not known.bend.any():  # a straight path was preferred
+                path = replace(path, bend=known.bend, cube=known.cube)
+            path = replace(path, pose=known.pose, blur=known.blur, skew=known.skew)
+            found.append(self._corrected(measured, path))
+        if self._terms.exposure_s > 0.0:
+            found += self._best_of(measured, np.array([self._terms.exposure_s]))
+        if self._frame.draws == 0 or self._terms.curve:
+            coarse = self._best_of(measured, EXPOSURES * measured.frame_s)[0].motion.exposure_s
+            found += self._best_of(measured, NEARER * coarse)
+        return found
+
+    def _best_of(self, measured: MeasuredPath, times: ArrayF64) -> list[MotionFit]:
+        """Return fits of the measured motion during the exposure of ``times`` that explains most."""
+        fits = measured_fits(self._pair, [self._exposed(measured, float(time)) for time in times])
+        return [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.misfit).motion)]
+
+    def _exposed(self, measured: MeasuredPath, seconds: float) -> FrameMotion:
+        return measured.exposed(seconds, self._shot.camera, finest_level(self._pair).median)
+
+    def _corrected(self, measured: MeasuredPath, path: FrameMotion) -> MotionFit:
+        known = measured.measurement(path.exposure_s, self._shot.camera, path.median_depth)
+        return corrected(self._pair, path, known, pose=self._terms.pose)
+
+    def accepted(self, found: list[MotionFit], still: MotionFit) -> MotionFit:
+        """Return the best of ``found`` that explains enough more than ``still``, else ``still``.
+
+        The model that the frame had needs only half as much, and so does a measured motion. A measured motion
+        during the exposure time of the frames around it must only explain no less.
+        """
+        best = preferred(found)
+        if best.model == still.model:
+            return min(best, still, key=lambda fit: fit.misfit)
+        known = best.model == self._frame.model or best.motion.exposure_s > 0.0
+        gain = explained_share(best.misfit, still.misfit)
+        if gain >= self._config.accept * (0.5 if known else 1.0):
+            return best
+        alike = [fit for fit in found if 0.0 < fit.motion.exposure_s == self._terms.exposure_s]
+        exposed = min(alike, key=lambda fit: fit.misfit, default=still)
+        return exposed if exposed.misfit <= still.misfit else still
+
+    def unexplained(self, fit: MotionFit) -> BlurEvidence:
+        """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
+        return _unexplained(self._pair, self._rendered, fit)
+
+    def reason(self, found: list[MotionFit], best: MotionFit, evidence: BlurEvidence) -> Reason | None:
+        """Return the reason to search the frame; None if there is none."""
+        frame, terms, rolls = self._frame, self._terms, self._terms.shutter == "rolls"
+        if terms.measured is None:
+            # A formation that was found under the other assumption about the shutter is searched again.
+            unmeasured = frame.skew_gain is None or frame.skew_gain > self._config.accept
+            if terms.shutter == "tested" or (rolls and unmeasured and _admitted(frame.model, rolling=False)):
+                return Reason.SHUTTER
+            if frame.draws == 0 and not terms.sparing:
+                return Reason.FIRST
+            if not _admitted(frame.model, rolls):
+                return Reason.MODEL
+            if terms.curve and (rolls or preferred(found[1:] or found).motion.order > 1):
+                return Reason.CURVE
+        enough = max(DOUBTED_EVIDENCE if terms.doubted else EVIDENCE, GROWN_EVIDENCE * frame.evidence)
+        blurred = evidence.gain > enough and best.misfit > MIN_MISFIT
+        known = best.model not in ("none", "skew")
+        if blurred and (known or not terms.sparing or self._resembles(evidence)):
+            return Reason.BLUR
+        return None
+
+    def _resembles(self, evidence: BlurEvidence) -> bool:
+        """Return True unless half of the blur that the test found raises the misfit too much (`WORSE`)."""
+        level = finest_level(self._pair)
+        blur = replace(blur_along(0.5 * evidence.length, evidence.angle), median_depth=level.median)
+        return level.evaluate("blur", blur).explained > WORSE
+
+    def searched(self, followed: list[MotionFit], best: MotionFit, evidence: BlurEvidence) -> list[MotionFit]:
+        """Return the fits of a search, the one without blur first, with that of the followed motion."""
+        camera, terms = self._shot.camera, self._terms
+        wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
+        if wide > self._margin:
+            self._show(wide)
+        resting = self._resting() if self._held is not None else followed[0]
+        whole = evidence if best.model == resting.model else self.unexplained(resting)
+        skews = terms.shutter != "still" and terms.measured is None
+        found = search(
+            self._pair,
+            start=None if skews else blur_along(whole.length, whole.angle),
+            skew=skews,
+            defocus=terms.shutter == "rolls" or whole.disc_gain > whole.line_gain,
+            pose=terms.pose,
+            held=self._held,
+        )
+        if skews:
+            self._frame = replace(self._frame, skew_gain=_skew_gain(found))
+        known = preferred(followed[1:] or followed)
+        if known.model not in ("none", "skew") or (known.model == "skew" and self._held is None):
+            motion, model = known.motion, known.model
+            if motion.exposure_s > 0.0 or self._held is not None:
+                found.append(finest_level(self._pair).evaluate(model, motion))
+            else:
+                found += refine(self._pair, model, motion, pose=terms.pose)[1:]
+        rolls = terms.shutter == "rolls" or self._held is not None
+        return [fit for fit in found if _admitted(fit.model, rolls)]
+
+    def described(self, best: MotionFit, evidence: float) -> FrameFormation:
+        """Return the frame with its new fit and the evidence of further blur."""
+        frame, shot = replace(self._frame, evidence=evidence), self._shot
+        return _described(frame, best, shot.factor, shot.camera, self._rendered, self._margin)
+
+
+def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvidence:
+    """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
+    shown = pair.luminance
+    if fit.model != "none":
+        assert rendered.depth is not None
+        fields = displacement_fields(fit.motion, pair.camera, rendered.depth, rendered.alpha, pair.margin)
+        light = np.repeat(pair.luminance[..., None], CHANNELS, axis=2)
+        exposed = Warp.of(fields, pair.margin).forward(torch.from_numpy(light).to(rendered.depth.device))
+        shown = exposed[..., 0].cpu().numpy()
+    elif pair.margin:
+        shown = shown[pair.margin : -pair.margin, pair.margin : -pair.margin]
+    return blur_evidence(np.ascontiguousarray(shown), pair.observed, pair.weight)
+
+
+def _admitted(model: Model, rolling: bool) -> bool:
+    return rolling or model not in ("skew", "both")
+
+
+def _skew_gain(found: list[MotionFit]) -> float:
+    """Return the share by which the best model with a skew reduces the misfit of the best one without."""
+    still = preferred([e for e in found if _admitted(e.model, rolling=False)])
+    rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
+    return max(0.0, explained_share(rolled.misfit, still.misfit))
+
+
+def frame_pair(
+    rendered: Render, affine: Tensor | None, target: Tensor, mask: Tensor | None, camera: Camera, margin: int
+) -> FramePair:
+    """Return the images that a search compares. Masked pixels of the frame show the render."""
+    assert rendered.depth is not None
+    image = rendered.image
+    if affine is not None:
+        image = backend_for(image.device).apply_affine(image, affine)
+    shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
+    counts = np.ones(seen.shape[:2], np.bool_) if mask is None else mask.cpu().numpy()
+    inner = shown[margin : margin + camera.height, margin : margin + camera.width]
+    return FramePair(
+        luminance(shown),
+        rendered.depth.cpu().numpy(),
+        rendered.alpha.cpu().numpy(),
+        luminance(np.where(counts[..., None], seen, inner)),
+        counts.astype(np.float32),
+        camera,
+        margin,
+    )
+
+
+def _described(
+    frame: FrameFormation, best: MotionFit, factor: float, camera: Camera, rendered: Render, margin: int
+) -> FrameFormation:
+    """Return the frame with a new fit; lengths are in pixels of the full image."""
+    if best.model == "none":
+        return FrameFormation(
+            frame.frame_id,
+            FrameMotion(median_depth=best.motion.median_depth),
+            misfit=best.misfit,
+            misfit_still=best.misfit_still,
+            skew_gain=frame.skew_gain,
+            evidence=frame.evidence,
+            draws=frame.draws,
+        )
+    motion = _scaled(best.motion, 1.0 / factor)
+    depth, alpha = rendered.depth, rendered.alpha
+    assert depth is not None
+
+    def fields(of: FrameMotion) -> DisplacementFields:
+        return displacement_fields(of, camera, depth, alpha, margin, factor)
+
+    whole, turned = fields(motion), fields(FrameMotion(blur=motion.skew, median_depth=motion.median_depth))
+    return replace(
+        frame,
+        motion=motion,
+        model=best.model,
+        misfit=best.misfit,
+        misfit_still=best.misfit_still,
+        blur_px=float(path_lengths(whole).mean(dtype=np.float64)) / factor,
+        skew_px=float(path_lengths(turned).mean(dtype=np.float64)) / factor,
+        defocus_px=float(whole.radius.cpu().numpy().mean(dtype=np.float64)) / factor,
+        reach_px=reach_of(whole) / factor,
+    )
+
+
+def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
+    if factor == 1.0:
+        return motion
+    return replace(motion.with_vector(factor * motion.vector), disc_px=factor * motion.disc_px)
