@@ -96,8 +96,7 @@ class TextureLoss:
         maps = []
         for index, (kernel, bias) in enumerate(self._layers):
             if index == 2:
-                # The gradient of max_pool2d has no fixed order on a GPU.
-                x = x.unflatten(3, (-1, 2)).unflatten(2, (-1, 2)).amax(dim=(3, 5))
+                x = functional.max_pool2d(x, 2)  # no overlap: on a GPU, its gradient has no sums either
             x = functional.relu(functional.conv2d(x, kernel, bias, padding=1))
             if index > 0:
                 maps.append(x)
