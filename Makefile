@@ -1,4 +1,4 @@
-# make demo              run all stages on a synthetic capture
+# make demo              install the program and run all stages on a small synthetic capture; the last line names its report
 # make env               install the program alone, in .venv
 # make test              run all tests that are not slow
 # make test-all          run all tests
@@ -23,8 +23,9 @@ TORCH_INDEX ?=
 
 # $(call install,ENVIRONMENT,SECTIONS OF requirements.lock,OUR PACKAGE,PACKAGES OF PYTORCH): pip checks the digest of every
 # file, except those of torch, whose builds differ by machine.
-PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check
+PIP_INSTALL := python -m pip install --disable-pip-version-check
 define install
+	@echo "$(1): pip downloads Python packages, 0.4 GB without PyTorch, and shows each. PyTorch is 0.2 GB for CPUs, and some GB for GPUs."
 	awk -v wanted=" $(2) " '/^## /{take = index(wanted, " " $$2 " ")} take' requirements.lock > $(1)/requirements.txt
 	$(1)/bin/$(PIP_INSTALL) --require-hashes --no-deps -r $(1)/requirements.txt
 	$(if $(3),$(1)/bin/$(PIP_INSTALL) -c constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch $(4))
@@ -35,8 +36,11 @@ PINS := pyproject.toml requirements.lock constraints.txt
 .PHONY: demo env test test-all test-package drill fuzz findings test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
 
 env: .venv/demo.stamp
+	@echo "ClearGS is installed in $(CURDIR)/.venv. Next, in the folder of your video:"
+	@echo "  source $(CURDIR)/.venv/bin/activate"
+	@echo "  cleargs run walk.mp4 --quality draft"
 
-demo: env
+demo: .venv/demo.stamp
 	$(BIN)/cleargs demo
 
 # The tests of a file run in one process, so that they make shared fixtures once.

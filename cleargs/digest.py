@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -44,10 +44,11 @@ def tree_digest(files: Mapping[str, str]) -> str:
     return json_digest(dict(files))
 
 
-def files_under(path: Path) -> dict[str, Path]:
+def files_under(path: Path, left_out: Callable[[Path], bool] = lambda folder: False) -> dict[str, Path]:
     """Return relative POSIX path -> file, for all files below the folder ``path`` that are not hidden.
 
-    Each folder is entered once, by its own name if it also has links: links may form loops.
+    Each folder is entered once, by its own name if it also has links: links may form loops. Folders for which
+    ``left_out`` is True are not entered.
     """
     found, entered, folders, links = {}, set(), [path], list[Path]()
     while folders or links:
@@ -61,6 +62,8 @@ def files_under(path: Path) -> dict[str, Path]:
                 if place.name.startswith("."):
                     continue
                 if place.is_dir():
+                    if left_out(place):
+                        continue
                     (links if place.is_symlink() else folders).append(place)
                 else:
                     found[place.relative_to(path).as_posix()] = place

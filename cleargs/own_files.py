@@ -7,6 +7,7 @@ may be a link, because the user named it.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,9 @@ from pathlib import Path
 from cleargs.errors import StoreError
 from cleargs.files import PARTIAL_SUFFIX, atomic_path, is_free
 from cleargs.safe_io import open_own, read_bytes
+
+ABANDONED_S = 3600.0
+"""Seconds without a change after which a partial file is a leftover. Living writers write more often."""
 
 
 def nodes_below(folder: Path) -> Iterator[os.DirEntry[str]]:
@@ -93,9 +97,14 @@ def refuse_links(paths: Iterable[Path]) -> None:
 
 
 def leftovers(folder: Path, name: str = "*") -> list[Path]:
-    """Return the partial folders in ``folder`` of processes that died while they wrote ``name``.
+    """Return the partial files and folders in ``folder`` of processes that died while they wrote ``name``.
 
-    If the file system has no locks, none is returned.
+    Files count if they did not change for `ABANDONED_S`, because they have no locks. If the file system has
+    no locks, no folder is returned.
     """
-    found = folder.glob(f".{'[0-9a-f]' * 8}{PARTIAL_SUFFIX}.{name}")
-    return [path for path in sorted(found) if path.is_dir() and not path.is_symlink() and is_free(path)]
+    found = sorted(folder.glob(f".{'[0-9a-f]' * 8}{PARTIAL_SUFFIX}.{name}"))
+    return [path for path in found if not path.is_symlink() and (_is_abandoned(path) or is_free(path))]
+
+
+def _is_abandoned(path: Path) -> bool:
+    return path.is_file() and time.time() - path.stat().st_mtime > ABANDONED_S

@@ -28,7 +28,7 @@ class Pack(FrozenModel):
 def read_pack(run: Path) -> Pack | None:
     """Return the content of `PACK`; None if ``run`` is not packed. Raises StoreError if it is damaged."""
     with faults_as(StoreError, f"cannot read {run / PACK}", hint="unpack the ZIP file again"):
-        return Pack.model_validate(read_json(run / PACK)) if (run / PACK).is_file() else None
+        return Pack.model_validate(read_json(run / PACK, root=run)) if (run / PACK).is_file() else None
 
 
 def require_images(run: Path, work: str) -> None:

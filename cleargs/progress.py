@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -115,6 +116,19 @@ class ForwardingTask(CountedTask):
         super().update(done=done, note=note, share=share)
 
 
+class BothTasks(CountedTask):
+    """A task that forwards to two others, which so have the same estimate of the remaining time."""
+
+    def __init__(self, *tasks: Task) -> None:
+        super().__init__(None, lambda done, note, left: None)
+        self._tasks = tasks
+
+    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
+        super().update(done=done, note=note)
+        for task in self._tasks:
+            task.update(done=done, note=note, share=share)
+
+
 class SilentReporter:
     """A reporter that discards everything."""
 
@@ -127,28 +141,69 @@ class SilentReporter:
     def warn(self, text: str) -> None: ...
 
 
+@contextmanager
+def repeated(act: Callable[[], None], seconds: float) -> Iterator[None]:
+    """Call ``act`` in a thread every ``seconds`` until the block ends."""
+    ended = threading.Event()
+
+    def loop() -> None:
+        while not ended.wait(seconds):
+            act()
+
+    thread = threading.Thread(target=loop, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 class LineReporter:
     """A reporter that passes lines to functions: remarks, warnings, and the progress of each task."""
 
     def __init__(self, info: Say, warn: Say, progress: Say) -> None:
         self._info, self._warn, self._progress = info, warn, progress
+        self._open: list[str] = []
+        """Labels of the tasks that are open, the innermost last."""
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         last = begin = time.monotonic()
+        end: float | None = None
+        """Expected end of the task, by the clock of `last`."""
         if total is None:  # there may be no other line until the end
             self._progress(f"{label}: started")
 
-        def show(done: int, note: str, left: float | None) -> None:
+        def line() -> None:
             nonlocal last
-            if time.monotonic() - last >= LINE_EVERY:
-                last = time.monotonic()
-                count = f"{label}: {done}" + (f"/{total}" if total else "")
-                rest = "" if left is None else f"{left:.0f} s left"
-                self._progress(", ".join(filter(None, (count, note, rest))))
+            last = time.monotonic()
+            count = (
+                f"{label}: {task.done}/{total}" if total else f"{label}: {task.done or ''}".removesuffix(": ")
+            )
+            rest = (
+                f"{end - last:.0f} s left" if end is not None and end >= last else f"for {last - begin:.0f} s"
+            )
+            self._progress(", ".join(filter(None, (count, task.note, rest))))
+
+        def show(done: int, note: str, left: float | None) -> None:
+            nonlocal end
+            now = time.monotonic()
+            end = None if left is None else now + left
+            if now - last >= LINE_EVERY:
+                line()
+
+        def still_there() -> None:
+            if time.monotonic() - last >= 0.8 * LINE_EVERY and self._open[-1:] == [label]:
+                line()
 
         task = CountedTask(total, show)
-        yield task
+        self._open.append(label)
+        try:
+            with repeated(still_there, 0.2 * LINE_EVERY):
+                yield task
+        finally:
+            self._open.remove(label)
         note = f", {task.note}" if task.note else ""
         self._progress(f"{label}: done in {time.monotonic() - begin:.1f} s{note}")
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest, has_results, linked_manifest
+from cleargs.own_files import refuse_links
 from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag, installed
-from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_metadata, read_run_file, require_store
 
@@ -30,6 +29,7 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
     if run.is_file():
         raise InputError("--stage chooses among the scenes of a run", hint="leave it out for a file")
+    check_results(dag, run)
     done = [name for name in dag.names if scene_path(run, name).is_file() and has_results(run, name)]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage in done:
@@ -38,6 +38,18 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     message = f"{stage} has no scene in {run}" if stage else f"there is no scene in {run}"
     others = f"; the stages with a scene are {', '.join(done)}" if done else ""
     raise InputError(message, hint=f"see cleargs status {run}{others}")
+
+
+def check_results(dag: Dag, run: Path) -> None:
+    """Raise StoreError if results in ``run`` are behind a link that the store did not make, or have one."""
+    if read_pack(run) is not None:
+        refuse_links([run / SCENE])
+    for stage in dag.names:
+        if (run / stage).exists() and not has_results(run, stage):
+            raise StoreError(
+                f"{run / stage} is a link that leads elsewhere, or a link or a device is in it",
+                hint=f"remove it, then see cleargs status {run}",
+            )
 
 
 def scene_path(run: Path, stage: str) -> Path:
@@ -182,41 +194,30 @@ class Prepared:
 
         return ViewDataset(self.views(weights))
 
-    def to_nerfstudio(self, folder: str | Path) -> Path:
-        """Write images, COLMAP model and ``transforms.json`` into a new folder, for other trainers.
+    def to_nerfstudio(self, folder: str | Path, weights: Mapping[int, float] | None = None) -> Path:
+        """Write the capture into a new folder, for nerfstudio, gsplat and other trainers of COLMAP projects.
 
-        ``images`` and ``sparse/0`` are next to each other, as gsplat and the Inria code read them. nerfstudio
-        reads ``transforms.json``. All poses are in normalised coordinates. Held-out frames are included.
+        The folder has ``transforms.json`` with the split and the sparse points, for nerfstudio; a COLMAP
+        project (``images``, ``sparse/0``) whose order makes every 8th image a held-out one where their number
+        allows it, for gsplat's ``simple_trainer``; ``split.json`` with the same split, names and weights; and
+        ``masks`` where the capture has some. All poses are in normalised coordinates.
+
+        Args:
+            folder: The new folder.
+            weights: frame_id -> weight, such as ``run["rva"].weights()``. Training frames of weight 0 are
+                left out.
 
         Raises:
             InputError: if the folder is in the input, or the run is packed.
             StoreError: if the folder exists or cannot be written.
 
         Example:
-            cg.open_prepared(cg.open_run("run")["ingest"]).to_nerfstudio("for-gsplat")
+            run = cg.open_run("run")
+            cg.open_prepared(run["ingest"]).to_nerfstudio("for-gsplat", run["rva"].weights())
         """
-        import numpy as np
+        from cleargs.handover import write_handover
 
-        from cleargs.files import whole_folder, write_json
-
-        target, frames = Path(folder), []
-        run = self.folder.parent
-        require_images(run, "writing them")
-        check_outputs([target], installed(), run)
-        by_id = {frame.frame_id: frame for frame in self.frames}
-        with whole_folder(target) as made:
-            shutil.copytree(self.folder / "colmap/sparse/0", made / "sparse/0")
-            (made / "images").mkdir()
-            for number, camera in self.cameras().items():
-                image = Path(by_id[number].image)
-                shutil.copyfile(self.folder / image, made / "images" / image.name)
-                pose = np.linalg.inv(camera.world_to_camera) * [1.0, -1.0, -1.0, 1.0]  # OpenGL axes
-                lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-                size = {"w": camera.width, "h": camera.height}
-                entry = {"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()}
-                frames.append({**entry, **lens, **size})
-            write_json(made / "transforms.json", {"camera_model": "PINHOLE", "frames": frames})
-        return target
+        return write_handover(self.folder, self.frames, self.points, self.cameras(), Path(folder), weights)
 
     def views(self, weights: Mapping[int, float] | None = None) -> list[TrainingView]:
         """Return the views of a training: the frames with a pose that are not held out.

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
@@ -65,12 +66,17 @@ def preflight(config: ConsolidateConfig) -> None:
     load_scorer(config.scorer)
 
 
+def idle(sections: Mapping[str, Any]) -> bool:
+    """Return True for a draft, which makes no repairs."""
+    return bool(sections["g0"].quality == "draft")
+
+
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """Return the cost of the training."""
     from .cost import distillation, expected
 
     g0 = context.settings["g0"]
-    if g0.quality == "draft":
+    if idle(context.settings):
         return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
     return expected(context, distillation(context, context.config.distil), g0.cache_mb)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -150,6 +150,11 @@ def preflight(config: RivrConfig) -> None:
         load_scorer(name)
 
 
+def idle(sections: Mapping[str, Any]) -> bool:
+    """Return True for a draft, which makes no repairs."""
+    return bool(sections["g0"].quality == "draft")
+
+
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Return the cost of the candidates and of the distillations.
 
@@ -160,7 +165,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 
     config, g0 = context.config, context.settings["g0"]
     frames, megapixels = capture_size(context)
-    if g0.quality == "draft":
+    if idle(context.settings):
         return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
     targets = frames if config.targets == "all" else max(2, round(AUTO_SHARE * frames))
     deblurs = config.use_observation and config.undo_motion

@@ -1,8 +1,9 @@
 """Plant links in a run folder, as a hostile sender could, and check that nothing outside is read or changed.
 
-``python tests/planted_links.py --links 1000`` traces all commands on a toy run to find every path that they
-open, list, create, rename or delete. At each path it plants links of several kinds, one at a time. Then it
-gives the commands again.
+``python tests/planted_links.py --links 1000`` traces all commands to find every path that they open, list,
+create, rename or delete. At each path it plants links of several kinds, one at a time. Then it gives the
+commands again. Half of the links are in a toy run, which is computed again. The others are in a finished run
+and in an unpacked pack, which are shown, exported, rendered, evaluated and packed.
 """
 
 from __future__ import annotations
@@ -13,27 +14,52 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from io import StringIO
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-sys.path.append(str(Path(__file__).parent / "pipeline"))
+sys.path += [str(Path(__file__).parent / name) for name in ("helpers", "pipeline", "report")]
 
 import toy
+from colmap_model import write_no_formation, write_sparse
+from report_run import FinishedRun
 
 from cleargs.cli.main import invoke
+from cleargs.manifest import linked_manifest
+from cleargs.pipeline.dag import Dag, installed
 
-COMMANDS: tuple[tuple[str, ...], ...] = (
+Commands: TypeAlias = tuple[tuple[str, ...], ...]
+
+TOY_COMMANDS: Commands = (
     ("status", "RUN"),
     ("show", "RUN"),
     ("run", "CAPTURE", "-o", "RUN", "--no-report", "--set", "square.power=4", "--log", "RUN/all.log"),
     ("verify", "RUN"),
     ("run", "CAPTURE", "-o", "RUN", "--no-report", "--set", "square.power=2", "--force", "total"),
     ("gc", "RUN", "--checkpoints", "--yes"),
+)
+
+SCENE_COMMANDS: Commands = (
+    ("show", "RUN", "--frame", "2", "-o", "OUT/frame.png", "--force"),
+    ("export", "RUN", "-o", "OUT/a.ply", "--prune", "contribution:0.1", "--cameras", "--force"),
+    ("render", "RUN", "-o", "OUT/a.png", "--frame", "2", "--side-by-side", "--force"),
+    ("eval", "RUN", "--lpips", "none", "--scorers", "none", "--stage", "all"),
+    ("pack", "RUN", "-o", "OUT/a.zip", "--force"),
+    ("report", "RUN", "--single-file"),
+    ("verify", "RUN"),
+)
+
+PACKED_COMMANDS: Commands = (
+    ("status", "RUN"),
+    ("show", "RUN", "--frame", "2"),
+    ("export", "RUN", "-o", "OUT/a.ply", "--cameras", "--force"),
+    ("render", "RUN", "-o", "OUT/a.png", "--frame", "2", "--force"),
+    ("report", "RUN", "--single-file"),
+    ("verify", "RUN"),
 )
 
 KINDS = (
@@ -60,7 +86,7 @@ class Trace:
             return
         self.on = False
         try:
-            for path in arguments[:2]:
+            for path in arguments[: 1 if event == "open" else 2]:
                 if isinstance(path, str | bytes | os.PathLike):
                     self._note(event, os.fsdecode(path), arguments)
         finally:
@@ -95,58 +121,30 @@ def open_folders() -> list[Path]:
 
 @dataclass
 class Planter:
-    """A run with finished, unused, cached and unfinished work, and a folder outside with the user's files."""
+    """A run, the commands that are given on it, and a folder outside with the user's files."""
 
     root: Path
-    bench: toy.Bench = field(init=False)
+    folder: Path
+    """The run."""
+    dag: Dag
+    commands: Commands
+    words: Mapping[str, Path]
+    """Word of a command, or begin of one -> path in its place."""
     trace: Trace = field(init=False)
 
     def __post_init__(self) -> None:
-        self.bench = toy.make_bench(self.root)
-        self.trace = Trace(self.bench.folder, self.root / "outside")
+        self.trace = Trace(self.folder, self.root / "outside")
         sys.addaudithook(self.trace)
-        recipe = self.root / "recipe.toml"
-        recipe.write_text("[square]\npower = 2\n")
-        capture, run = str(self.bench.capture), str(self.bench.folder)
-        for power in (3, 2):
-            more = ["--recipe", str(recipe), "--set", f"square.power={power}"]
-            with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-                assert invoke(["run", capture, "-o", run, "--no-report", *more], self.bench.dag) == 0
-        self._interrupted()
-        kept = self.bench.store / "kept" / "square" / f"{5:064x}.json"
-        kept.parent.mkdir(parents=True)
-        kept.write_text("{}")
         self.first = self.root / "first"
-        shutil.copytree(self.bench.folder, self.first, symlinks=True)
-
-    def _interrupted(self) -> None:
-        """Leave the unfinished work of a stage that was interrupted at its third number."""
-        noted = toy.note
-
-        def interrupting(journal: Path, line: str) -> None:
-            if line == "square 3.txt":
-                raise KeyboardInterrupt
-            noted(journal, line)
-
-        toy.note = interrupting
-        try:
-            assert self.give(COMMANDS[2]) == 130
-        finally:
-            toy.note = noted
-        assert list(self.bench.store.glob("work/*/checkpoints/state.txt"))
+        shutil.copytree(self.folder, self.first, symlinks=True)
 
     def give(self, command: Sequence[str]) -> int:
         """Give a command, and return its exit code."""
-        words = {"RUN": str(self.bench.folder), "CAPTURE": str(self.bench.capture)}
-        arguments = [words.get(word, word.replace("RUN/", f"{self.bench.folder}/")) for word in command]
-        with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as said:
-            code = invoke(arguments, self.bench.dag)
-        assert "unexpected" not in said.getvalue(), f"{command}: {said.getvalue()}"
-        return code
+        return give(command, self.dag, self.words)
 
     def restore(self) -> None:
-        shutil.rmtree(self.bench.folder)
-        shutil.copytree(self.first, self.bench.folder, symlinks=True)
+        shutil.rmtree(self.folder)
+        shutil.copytree(self.first, self.folder, symlinks=True)
         shutil.rmtree(self.trace.outside, ignore_errors=True)
         self.trace.outside.mkdir()
 
@@ -155,8 +153,8 @@ class Planter:
         self.restore()
         self.trace.used = set()
         self.trace.on = True
-        for command in COMMANDS:
-            self.give(command)
+        for command in self.commands:
+            assert self.give(command) == 0, command
         self.trace.on = False
         found = self.trace.used | {path.relative_to(self.first) for path in self.first.rglob("*")}
         found |= {parent for path in found for parent in path.parents}
@@ -165,7 +163,7 @@ class Planter:
     def plant(self, path: Path, kind: str) -> bool:
         """Put a link to a copy in the place of ``path``. Return False if that is impossible."""
         self.restore()
-        place, goal = self.bench.folder / path, self.trace.outside / "goal"
+        place, goal = self.folder / path, self.trace.outside / "goal"
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
         except OSError:
@@ -195,7 +193,7 @@ class Planter:
                 "link": goal,
                 "relative link": Path(os.path.relpath(goal, place.parent)),
                 "dangling link": self.trace.outside / "new",
-                "link to the run": self.bench.folder,
+                "link to the run": self.folder,
                 "link to a link": self.trace.outside / "another",
                 "link to the parent": Path(".."),
             }
@@ -207,15 +205,81 @@ class Planter:
         """Plant a link, give all commands, and check the outside. Return False if it cannot be planted."""
         if not self.plant(path, kind):
             return False
-        before = snapshot(self.trace.outside)
+        outside = self.trace.outside
+        before = snapshot(outside)
         self.trace.touched = set()
-        for command in COMMANDS:
+        for command in self.commands:
+            age(outside)
             self.trace.on = kind != "hard link"
             self.give(command)
             self.trace.on = False
-            assert snapshot(self.trace.outside) == before, f"{command} with a {kind} at {path}"
-            assert not self.trace.touched, f"{command} with a {kind} at {path}: {self.trace.touched}"
+            read = set() if kind == "hard link" else read_since(outside)
+            assert not read | self.trace.touched, (
+                f"{command} with a {kind} at {path}: {self.trace.touched or read}"
+            )
+            assert snapshot(outside) == before, f"{command} with a {kind} at {path}"
         return True
+
+
+def give(command: Sequence[str], dag: Dag, words: Mapping[str, Path]) -> int:
+    """Give a command with a path for each of the ``words``, and return its exit code."""
+    arguments = []
+    for argument in command:
+        word, slash, rest = argument.partition("/")
+        arguments.append(f"{words[word]}{slash}{rest}" if word in words else argument)
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as said:
+        code = invoke(arguments, dag)
+    assert "unexpected" not in said.getvalue(), f"{command}: {said.getvalue()}"
+    return code
+
+
+def toy_run(root: Path) -> Planter:
+    """Make a run with finished, unused, cached and unfinished work."""
+    bench = toy.make_bench(root)
+    recipe = root / "recipe.toml"
+    recipe.write_text("[square]\npower = 2\n")
+    words = {"RUN": bench.folder, "CAPTURE": bench.capture}
+    for power in (3, 2):
+        more = ("--recipe", str(recipe), "--set", f"square.power={power}")
+        assert give(("run", "CAPTURE", "-o", "RUN", "--no-report", *more), bench.dag, words) == 0
+    noted = toy.note
+
+    def interrupting(journal: Path, line: str) -> None:
+        if line == "square 3.txt":
+            raise KeyboardInterrupt
+        noted(journal, line)
+
+    toy.note = interrupting
+    try:
+        assert give(TOY_COMMANDS[2], bench.dag, words) == 130
+    finally:
+        toy.note = noted
+    assert list(bench.store.glob("work/*/checkpoints/state.txt"))
+    kept = bench.store / "kept" / "square" / f"{5:064x}.json"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("{}")
+    return Planter(root, bench.folder, bench.dag, TOY_COMMANDS, words)
+
+
+def finished_run(root: Path) -> Planter:
+    """Make a finished run with its results in a store, a report and an evaluation."""
+    made = FinishedRun(root, held_out=(0, 3))
+    write_sparse(made.folder / "ingest")
+    write_no_formation(made.folder / "consolidate")
+    made.finish("consolidate", {"psnr_unseen": 24.6})
+    for stage in made.dag.names:
+        manifest = linked_manifest(made.folder, stage)
+        assert manifest is not None
+        results = made.folder / ".store" / stage / manifest.key
+        results.parent.mkdir(parents=True)
+        (made.folder / stage).rename(results)
+        (made.folder / stage).symlink_to(results.relative_to(made.folder))
+    (made.folder / "scene.ply").symlink_to("consolidate/scene.ply")
+    (root / "out").mkdir()
+    words = {"RUN": made.folder, "OUT": root / "out"}
+    for command in SCENE_COMMANDS:
+        assert give(command, made.dag, words) == 0, command
+    return Planter(root, made.folder, made.dag, SCENE_COMMANDS, words)
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes | str]]:
@@ -227,9 +291,33 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes | str]]:
     return found
 
 
-def planted(root: Path, kinds: Sequence[str] = KINDS, depth: int = 99) -> Iterator[tuple[Path, str]]:
+def packed_run(root: Path) -> Planter:
+    """Pack a finished run, and unpack it."""
+    words = {"RUN": finished_run(root).folder, "OUT": root}
+    assert give(("pack", "RUN", "-o", "OUT/run.zip"), installed(), words) == 0
+    shutil.unpack_archive(root / "run.zip", root / "packed")
+    words["RUN"] = root / "packed" / "run"
+    return Planter(root / "packed", words["RUN"], installed(), PACKED_COMMANDS, words)
+
+
+def age(folder: Path) -> None:
+    """Set the access times in ``folder`` to 0. They show reads by libraries, which no hook sees."""
+    for path in folder.rglob("*"):
+        if path.is_file() and not path.is_symlink():
+            os.utime(path, ns=(0, path.stat().st_mtime_ns))
+
+
+def read_since(folder: Path) -> set[str]:
+    """Return the files in ``folder`` that were read since `age`."""
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    return {str(path) for path in files if path.stat().st_atime_ns}
+
+
+def planted(
+    root: Path, make: Callable[[Path], Planter], kinds: Sequence[str] = KINDS, depth: int = 99
+) -> Iterator[tuple[Path, str]]:
     """Check links of all ``kinds`` at all paths of at most ``depth`` parts, and yield each path and kind."""
-    planter = Planter(root)
+    planter = make(root)
     for path in (path for path in planter.paths() if len(path.parts) <= depth):
         for kind in kinds:
             if planter.check(path, kind):
@@ -239,12 +327,16 @@ def planted(root: Path, kinds: Sequence[str] = KINDS, depth: int = 99) -> Iterat
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--links", type=int, default=1000)
+    links = parser.parse_args().links
     root = Path(tempfile.mkdtemp(prefix="cleargs-planted-"))
-    done = list(islice(planted(root), parser.parse_args().links))
+    done = []
+    shares = {toy_run: links // 2, finished_run: links - links // 2 - links // 10, packed_run: links // 10}
+    for make, share in shares.items():
+        (root / make.__name__).mkdir()
+        done += islice(planted(root / make.__name__, make), share)
     shutil.rmtree(root)
-    print(
-        f"{len(done)} links at {len({path for path, _ in done})} paths: nothing outside was read or changed"
-    )
+    places = len({path for path, _ in done})
+    print(f"{len(done)} links at {places} paths: nothing outside was read or changed")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from pathlib import Path
 import click
 import pytest
 
+import cleargs as cg
 from benchmarks.commands import benchmarks
 from benchmarks.commands import invoke as invoke_benchmarks
 from cleargs.cli.main import cli, invoke
@@ -42,6 +43,16 @@ PAGES = tuple(
     if not path.is_relative_to(ROOT / "docs/experiments/results-older")
     and path.name != "results-older.md"  # has the commands of the versions that it measured
 )
+
+PAGES_NOT_RUN = {
+    "docs/cluster.md": "needs a cluster, or several captures; tests/batch runs such sheets",
+    "docs/datasets.md": "needs data sets of others",
+    "docs/developers.md": "changes files of the checkout",
+    "docs/gpu.md": "needs a GPU",
+    "docs/install.md": "installs packages; make test-package does so",
+    "docs/speed.md": "measures for minutes",
+}
+"""Page with commands that are only parsed -> reason. The experiments need captures and hours."""
 
 NOT_RUN = {
     "cleargs demo": "runs for minutes; make test-package runs a smaller one",
@@ -194,6 +205,14 @@ def test_commands_name_existing_programs_and_options(page: str) -> None:
     assert {text: what for text, what in found.items() if what} == {}
 
 
+def test_every_page_runs_or_says_why_not() -> None:
+    docs = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md")}
+    others = {page for page in docs if "\n```sh" in (ROOT / page).read_text(encoding="utf-8")} - set(
+        USER_PAGES
+    )
+    assert others == set(PAGES_NOT_RUN)
+
+
 def test_pages_have_commands() -> None:
     assert sum(1 for page in PAGES for _ in commands(page)) > 150
 
@@ -290,3 +309,25 @@ def test_commands_of_the_pages_run(place: Path, monkeypatch: pytest.MonkeyPatch)
         "mine.json",
     }
     assert Path("walk/scene.ply").is_file() and Path("walk/report.html").is_file() and not prepared
+
+
+@pytest.mark.slow  # about 15 s alone: the run `walk`, which the commands of the pages also make
+def test_the_first_example_of_the_library_runs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only smaller: 20 steps, and a film of 0.2 s."""
+    monkeypatch.chdir(place)
+    intro = (ROOT / "docs/api.md").read_text(encoding="utf-8").split("This page is made from")[0]
+    first, second = re.findall(r"(?ms)^```python\n(.*?)^```", intro)
+    size = {"frames": 6, "width": 96, "height": 54}
+    make_capture(Path("demo/capture"), "mixed", **size, seed=0, reporter=SilentReporter())
+    assert invoke(["run", "demo/capture", "-o", "demo/run", *shlex.split(TINY["run"])]) == 0
+    tiny = {"g0.steps": 20, "g0.min_points": 300, "g0.budget": 400}
+    for source in ("walk.mp4", "demo/capture"):
+        code = first.replace('"walk.mp4"', f'"{source}"').replace("seconds=6", "seconds=0.2")
+        code = code.replace('quality="draft"', f'quality="draft", set={tiny}')
+        for name in ("walk-z-up.ply", "walk-film.mp4", "walk-data"):
+            code = code.replace(f'"{name}"', f'"{source.partition("/")[0]}-{name}"')
+        names: dict[str, object] = {}
+        exec(code, names)
+        assert getattr(names["image"], "ndim", 0) == 3
+    exec(second, {"cg": cg})
+    assert Path("walk.mp4-walk-film.mp4").stat().st_size > 100

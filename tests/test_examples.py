@@ -7,6 +7,7 @@ import json
 import re
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
 
@@ -14,9 +15,11 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from plyfile import PlyData
 
 import cleargs as cg
 from cleargs.errors import CleargsError
+from cleargs.handover import gsplat_order
 from cleargs.progress import SilentReporter
 from cleargs.synth.synthetic_capture import make_capture
 
@@ -137,6 +140,44 @@ def test_other_trainers_find_images_and_model_in_one_folder(place: Path, tmp_pat
         assert (folder / frame["file_path"]).is_file() and (frame["w"], frame["h"]) == (96, 54)
     with pytest.raises(CleargsError):
         capture.to_nerfstudio(folder)
+
+
+def test_other_trainers_hold_out_the_same_frames(place: Path, tmp_path: Path) -> None:
+    """By the rules of nerfstudio 1.1.5 (lists of names) and of gsplat (every Nth by name)."""
+    capture = cg.open_prepared(cg.open_run(place / "run")["ingest"])
+    frames = [replace(f, split="test" if f.frame_id in (1, 6) else "train") for f in capture.frames]
+    weights = {frame.frame_id: 0.5 for frame in frames[1:]}
+    held = replace(capture, frames=frames).to_nerfstudio(tmp_path / "data", weights)
+    meta, facts = (json.loads((held / name).read_text()) for name in ("transforms.json", "split.json"))
+    files = {facts["names"][file] for file in meta["test_filenames"]}
+    assert files == {capture.frames[k].name for k in (1, 6)}
+    assert meta["val_filenames"] == meta["test_filenames"]
+    assert len(meta["train_filenames"]) == 5, "frame 0 has no weight"
+    listed = {*meta["train_filenames"], *meta["test_filenames"]}
+    assert {frame["file_path"] for frame in meta["frames"]} == listed
+    vertices = PlyData.read(held / meta["ply_file_path"])["vertex"]
+    assert np.allclose(vertices["x"], capture.points.xyz[:, 0])
+    assert (vertices["red"] == capture.points.rgb[:, 0]).all()
+    model = pycolmap.Reconstruction(str(held / "sparse/0"))
+    names = sorted(image.name for image in model.images.values())
+    assert {f"images/{name}" for name in names[:: facts["test_every"]]} == set(meta["test_filenames"])
+    assert not facts["not_in_sparse"] and len(model.points3D) == len(capture.points.xyz)
+
+
+@pytest.mark.parametrize("held", ["10000000" * 4, "0100100", "0111000000", "1010101011", "000"])
+def test_every_nth_image_is_one_that_was_held_out(held: str, place: Path) -> None:
+    some = cg.open_prepared(cg.open_run(place / "run")["ingest"]).frames[0]
+    frames = [replace(some, frame_id=k, split="test" if x == "1" else "train") for k, x in enumerate(held)]
+    every, order, extra = gsplat_order(frames)
+    assert sorted(f.frame_id for f in order + extra) == list(range(len(held)))
+    if "1" not in held or held.count("1") > held.count("0"):
+        assert every is None
+    else:
+        assert every is not None
+        assert all((f.split == "test") == (k % every == 0) for k, f in enumerate(order))
+        assert len(extra) <= held.count("1") // 2 and all(f.split == "test" for f in extra)
+    if held.startswith("1000"):
+        assert every == 8 and order == frames
 
 
 def test_a_capture_as_a_dataset(place: Path) -> None:

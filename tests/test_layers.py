@@ -17,6 +17,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cleargs.formation", "cleargs.rva"),
     ("cleargs.rivr", "cleargs.evaluate", "cleargs.synth"),
     ("cleargs.pipeline",),
+    ("cleargs.handover",),
     ("cleargs.run_results",),  # reads the results of a finished run
     ("cleargs.report", "cleargs.render"),
     ("cleargs.api_parts",),

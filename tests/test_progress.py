@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
+from threading import Event
 
 import pytest
 
 from cleargs import api, progress
 from cleargs.errors import InputError
-from cleargs.progress import CountedTask, Rate, log_reporter
+from cleargs.progress import BothTasks, CountedTask, LineReporter, Rate, log_reporter
 
 
 def test_the_rate_is_that_of_the_last_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,6 +51,54 @@ def test_the_remaining_time_is_never_negative(monkeypatch: pytest.MonkeyPatch) -
     now = 3600.0
     task.update(done=10, share=1.0 + 1e-15)
     assert shown == [None, 0.0]
+
+
+def test_screen_and_log_have_one_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, the log took the steps and the screen the share of the work: 75 s and 863 s left."""
+    clock = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    shown: dict[str, float | None] = {}
+    tasks = [
+        CountedTask(100, lambda d, n, left, x=name: shown.update({x: left})) for name in ("screen", "log")
+    ]
+    both = BothTasks(*tasks)
+    for clock[0], done, share in ((900.0, 10, 0.02), (910.0, 20, 0.04)):
+        both.update(done=done, share=share)
+    assert shown["screen"] == shown["log"] == pytest.approx(480.0)
+
+
+def test_a_task_without_steps_says_that_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.02)
+    lines: list[str] = []
+    seen = Event()
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if line.startswith("compiling, for "):
+            seen.set()
+
+    reporter = LineReporter(lines.append, lines.append, say)
+    with reporter.task("all scenes", 3), reporter.task("compiling"):
+        assert seen.wait(20)
+    assert not [line for line in lines if line.startswith("all scenes, for")], "the innermost task speaks"
+
+
+def test_a_line_without_a_step_keeps_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.02)
+    lines: list[str] = []
+    seen = Event()
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 3:
+            seen.set()
+
+    with LineReporter(say, say, say).task("cues", 1000) as task:
+        task.advance()
+        task.update(done=2, share=0.001 + 1e-9)  # so that the rest takes long
+        lines.clear()
+        assert seen.wait(20)
+    assert all(re.fullmatch(r"cues: 2/1000, \d+ s left", line) for line in lines[:3]), lines
 
 
 def test_remarks_of_the_library_are_logged(

@@ -23,20 +23,27 @@ first use. More scripts are in `examples/`.
 ```python
 import cleargs as cg
 
-run = cg.run("walk.mp4", quality="draft", progress=print)   # the folder walk, as `cleargs run walk.mp4`
+run = cg.run("walk.mp4", quality="draft", progress=print)  # makes the folder walk, as `cleargs run walk.mp4`
 print(run["rva"].table("frames").select(["name", "role", "weight"]))
 
-scene = run.scene()                                          # Gaussians and rendering options
-capture = cg.open_prepared(run["ingest"])                    # frames, cameras, sparse points
-image = cg.render_view(scene, capture.cameras()[0]).image    # [H, W, 3]
+scene = run.scene()  # Gaussians and rendering options
+capture = cg.open_prepared(run["ingest"])  # frames, cameras, sparse points
+camera = next(iter(capture.cameras().values()))  # of the first frame with a pose
+image = cg.render_view(scene, camera).image  # [H, W, 3]
 
-cg.export(run, "walk.ply", up="z", sh_degree=3)              # for Blender
-cg.film(run, "walk-film.mp4", seconds=6)                     # along the path of the capture
-print(cg.evaluate_scene(run, "room/truth/observed").means)   # against sharp images
+cg.export(run, "walk-z-up.ply", up="z")  # for Blender
+cg.film(run, "walk-film.mp4", seconds=6)  # along the path of the capture
 
-gsplat.rasterization(**scene.to_gsplat(), ...)               # other programs: gsplat,
-capture.to_nerfstudio("for-gsplat")                          # trainers that read COLMAP or nerfstudio,
-loader = torch.utils.data.DataLoader(capture.dataset())      # and your own in torch
+splats = scene.to_gsplat()  # arguments of gsplat.rasterization
+capture.to_nerfstudio("walk-data")  # for nerfstudio, gsplat, Brush and others
+dataset = capture.dataset()  # for your own training in torch
+```
+
+A synthetic capture has sharp images of the truth. After `cleargs demo`:
+
+```python
+demo = cg.open_run("demo/run")
+print(cg.evaluate_scene(demo, "demo/capture/truth/observed").means)
 ```
 
 This page is made from the source: `python -m tools.api_page > docs/api.md`.

@@ -164,6 +164,12 @@ class Batch:
                 f"{self.folder} is not empty and is not a batch; it has {listed(names)}",
                 hint=f"choose a new or empty folder, for example -o {self.folder / 'batch'}",
             )
+        began = summary.is_file() or (self.folder / "plan.json").is_file()  # it exports after that
+        if not began and (exported := visible_names(self.exports)):
+            raise InputError(
+                f"{self.exports} was not made by a batch; it has {listed(exported)}",
+                hint="move it, or choose another folder with -o",
+            )
 
     def plan(self, scene: SceneJob) -> list[StagePlan]:
         """Return the state of each stage. Raises CleargsError if the capture cannot be read."""

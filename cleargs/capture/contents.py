@@ -16,7 +16,16 @@ from pathlib import Path
 
 from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import frame_key, image_files, is_wanted, mask_externals, masks_of, natural_key
+from cleargs.capture.folders import (
+    frame_key,
+    image_files,
+    is_wanted,
+    mask_externals,
+    masks_of,
+    natural_key,
+    unmasked,
+)
+from cleargs.digest import files_under
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 from cleargs.media.headers import Header, lacks_package, read_header
@@ -31,12 +40,17 @@ of their number, or if they have the numbers of others in their names."""
 _REDUCED = 0.75  # share of the long side up to which a folder with the names of another one has copies
 
 _SYSTEM = re.compile(r"[.@#]|__MACOSX$")  # start of the names of hidden folders and of those of network disks
-_MASK_FOLDER = re.compile(r"masks?", re.IGNORECASE)
-_MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]masks?)?", re.IGNORECASE)
-_PROCESSED = re.compile(r"correct|undist|rectif|edit|resiz|enhanc", re.IGNORECASE)
+_MASK_FOLDER = re.compile(r"(.+[._-])?masks?", re.IGNORECASE)
+_PROCESSED = re.compile(
+    r"correct|undist|rectif|edit|resiz|enhanc|normal|semantic|segment|label|instance|albedo|depth|dispar|flow",
+    re.IGNORECASE,
+)
+_EDITED = re.compile(r"IMG_E(\d+)|(.+)[-_ ]edited|(.+) \(\d+\)", re.IGNORECASE)
+"""Names of second versions: edited on iPhones, by Google Photos, and downloaded twice."""
 _PREVIEW_NAME = re.compile(r"thumb|preview|poster|contact.?sheet", re.IGNORECASE)
 
 MASKS, DEPTH, GREY = "mask%s", "depth map%s", "picture%s of one channel"
+ALONE = "mask%s without a photograph of the same name"
 VIDEOS, RAW, UNREADABLE = "video%s", "raw or other picture%s", "HEIC picture%s without pillow-heif"
 PREVIEWS, COPIES, OUTSIDE = (
     "preview%s",
@@ -46,6 +60,7 @@ PREVIEWS, COPIES, OUTSIDE = (
 PHOTOGRAPHS, UNWANTED = "photograph%s", "file%s by --only or --skip"
 _HINTS = {
     VIDEOS: "photographs are taken; for the videos, give one as the input, or set --skip for the photographs",
+    ALONE: "name masks like their photographs",
     RAW: "convert them to JPEG or PNG",
     UNREADABLE: "pip install 'cleargs[heif]', or convert them to JPEG",
 }
@@ -160,19 +175,23 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     left_out[PHOTOGRAPHS if is_video else VIDEOS] = images if is_video else videos
     images.sort(key=lambda path: frame_key(path.relative_to(root).as_posix()))
     made = Contents(root, images, videos, {}, left_out, is_video)
-    return replace(made, masks=_paired(made, left_out[MASKS]))
+    made = replace(made, masks=_paired(made, left_out[MASKS]))
+    used = list(made.masks.values())
+    alone = [] if is_video else _without(left_out[MASKS], used)
+    left_out[MASKS] = _without(left_out[MASKS], alone)
+    kind = ALONE if len(wanted) == len(found) else UNWANTED  # their photographs may not be wanted
+    left_out[kind] = [*left_out.get(kind, ()), *alone]
+    return made
 
 
 def media_files(root: Path) -> list[Path]:
     """Return pictures and videos below ``root``, without hidden ones and those of runs."""
-    found = []
     suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
-    for folder, folders, names in os.walk(root, followlinks=True):
-        below = [name for name in sorted(folders) if not _SYSTEM.match(name)]
-        folders[:] = [name for name in below if not Path(folder, name, "run.toml").is_file()]
-        paths = [Path(folder, name) for name in sorted(names) if not name.startswith(".")]
-        found += [path for path in paths if path.suffix.lower() in suffixes and path.is_file()]
-    return found
+    found = files_under(
+        root, lambda folder: bool(_SYSTEM.match(folder.name)) or (folder / "run.toml").is_file()
+    )
+    files = (path for path in found.values() if path.suffix.lower() in suffixes and path.is_file())
+    return sorted(files, key=lambda path: (path.parent, path.name))
 
 
 def _without(files: Sequence[Path], others: Sequence[Path]) -> list[Path]:
@@ -187,19 +206,13 @@ def _mask_folder(path: Path, root: Path) -> Path | None:
     return next((Path(*path.parts[: n + 1]) for n in found), None)
 
 
-def _unmasked(path: Path) -> Path:
-    """Return ``path`` without its ending and without the word "mask" at either end of its name."""
-    found = _MASK_NAME.fullmatch(path.stem)
-    return path.with_name(found[1] if found else path.stem)
-
-
 def _masks(images: Sequence[Path], root: Path) -> list[Path]:
     """Return the masks among ``images``, by their folders and names. If all would be masks, none is one."""
     stems = {path.with_suffix("") for path in images}
     masks = [
         path
         for path in images
-        if _mask_folder(path, root) or (_unmasked(path) != path.with_suffix("") and _unmasked(path) in stems)
+        if _mask_folder(path, root) or (unmasked(path) != path.with_suffix("") and unmasked(path) in stems)
     ]
     return masks if len(masks) < len(images) else []
 
@@ -209,7 +222,7 @@ def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
     by_stem = {path.with_suffix(""): path for path in contents.photographs}
     root = contents.folder
     names = {path.relative_to(root).as_posix(): path for path in contents.photographs}
-    found = {by_stem[_unmasked(mask)]: mask for mask in masks if _unmasked(mask) in by_stem}
+    found = {by_stem[unmasked(mask)]: mask for mask in masks if unmasked(mask) in by_stem}
     for folder in dict.fromkeys(_mask_folder(mask, contents.root) for mask in masks):
         if folder is not None:
             found |= {names[name]: mask for name, mask in masks_of(folder, list(names)).items()}
@@ -259,6 +272,7 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
     """
     stems: dict[Path, Path] = {}
     second = [path for path in images if stems.setdefault(path.with_suffix(""), path) is not path]
+    second += [path for path in _without(images, second) if _is_second(path, stems)]
     folders: dict[Path, dict[str, Path]] = defaultdict(dict)
     for path in _without(images, second):
         folders[path.parent][path.stem.lower()] = path
@@ -278,6 +292,14 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
         else:
             kept.append(files)
     return second
+
+
+def _is_second(path: Path, stems: Mapping[Path, Path]) -> bool:
+    """Return True if ``path`` is named as an edited version of one of ``stems``, or is a second download."""
+    if (found := _EDITED.fullmatch(path.stem)) is None:
+        return False
+    first = stems.get(path.with_name(f"IMG_{found[1]}" if found[1] else found[2] or found[3]))
+    return first is not None and (found[3] is None or cmp(path, first, shallow=False))
 
 
 def _pixels(header: Header | None) -> int:

@@ -17,6 +17,8 @@ from cleargs.media import IMAGE_SUFFIXES
 
 T = TypeVar("T")
 
+_MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]masks?)?", re.IGNORECASE)
+
 
 def image_folders(root: Path) -> list[Path]:
     """Return ``images/`` and its reductions ``images_N/`` below ``root``, the largest images first.
@@ -134,17 +136,24 @@ def mask_externals(source: Path) -> dict[str, External]:
     return {} if masks is None else {"masks": masks}
 
 
+def unmasked(path: Path) -> Path:
+    """Return ``path`` without its ending and without the word "mask" at either end of its name."""
+    found = _MASK_NAME.fullmatch(path.stem)
+    return path.with_name(found[1] if found else path.stem)
+
+
 def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
     """Return the masks in ``folder``, by the names of their images.
 
-    A mask has the same relative path as its image, with the stem or the full name (COLMAP's form). If only
-    one image has its stem, the mask may be in another subfolder.
+    A mask has the same relative path as its image, with the stem or the full name (COLMAP's form). Its
+    name may begin or end with the word "mask" (Metashape's form). If only one image has its stem, the mask
+    may be in another subfolder.
     """
     if folder is None:
         return {}
-    found = {
-        path.relative_to(folder).with_suffix("").as_posix(): path for path in image_files(folder, below=True)
-    }
+    files = {path.relative_to(folder): path for path in image_files(folder, below=True)}
+    found = {unmasked(below).as_posix(): path for below, path in files.items()}
+    found |= {below.with_suffix("").as_posix(): path for below, path in files.items()}
     stems = Counter(PurePosixPath(name).stem for name in names)
     masks = {}
     for name in names:
@@ -169,6 +178,21 @@ def chosen(
     return tuple(
         replace(frame, mask=frame.mask or masks.get(name))
         for frame, name in spread(list(zip(frames, names, strict=True)), at_most)
+    )
+
+
+def listed_pictures(frames: Sequence[SourceFrame], source: Path, listing: str) -> str:
+    """Return a line on the pictures that a ``listing`` of poses names, and on those that are left out."""
+    taken, masks = {frame.path for frame in frames}, mask_folder(source)
+    others = [path for path in image_files(source, below=True) if masks not in path.parents]
+    places = Counter(path.parent.relative_to(source).as_posix() for path in others if path not in taken)
+    posed = sum(frame.pose is not None for frame in frames)
+    line = f"read: {len(frames)} pictures, {posed} with a pose in {listing}"
+    if not places:
+        return line
+    named = [f"{place}/ {count}" for place, count in sorted(places.items())]
+    return (
+        f"{line}; left out: {places.total()} others ({', '.join([*named[:4], *['...'][: len(named) - 4]])})"
     )
 
 

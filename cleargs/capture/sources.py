@@ -48,7 +48,7 @@ def whole_capture(path: Path) -> Path:
         return folder.parent if folder.name in _IMAGES and known else folder
     elif path.name not in _TABLES | _LISTS and path.suffix.lower() != ".db":
         return path
-    while folder.name.isdecimal() or folder.name in _MODELS:
+    while folder.name in _MODELS or (folder.name.isdecimal() and not media_files(folder)):
         folder = folder.parent
     return folder
 

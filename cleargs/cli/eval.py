@@ -25,7 +25,8 @@ from cleargs.manifest import has_results
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE, check_links
-from cleargs.run_results import scene_path, scene_stage
+from cleargs.pipeline.store import visible_names
+from cleargs.run_results import check_results, scene_path, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
@@ -118,7 +119,11 @@ stages and options stay there as long as their scenes do.
     show_default=True,
     help="Measure a second time, with each rendered pose fitted to its reference in this many steps.",
 )
-@click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
+@click.option(
+    "--save-renders",
+    type=click.Path(path_type=Path),
+    help="Keep the evaluated images (PNG) in this new folder.",
+)
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
 @fail_below_option("psnr, ssim ...")
 @threads_option
@@ -171,6 +176,8 @@ def eval(
     results = [] if output is None else [output, output.with_suffix(".parquet")]
     written = results if save_renders is None else [*results, save_renders]
     check_outputs(written, dag, run, inputs=[place for place in given if place is not None])
+    if save_renders is not None and visible_names(save_renders):
+        raise InputError(f"{save_renders} is not empty", hint="choose a new folder for --save-renders")
     if any(file.exists() for file in results):
         read_report(results[0])  # only results of this command are replaced
     reporter = make_reporter(quiet)
@@ -249,6 +256,7 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
             f"{target} is not a run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
         )
     check_links(target)
+    check_results(dag, target)
     if "all" in stages:
         chosen = [
             name for name in dag.names if has_results(target, name) and scene_path(target, name).is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -24,7 +25,9 @@ Examples:
   cleargs export room -o room.ply --metres 0-40=3.5   frames 0 and 40 were filmed 3.5 m apart
   cleargs export room -o room.ply --world input    in the world of the capture's poses
   cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
+  cleargs export room -o room.ply --drop sphere:0.2,-1,3,0.1   without a floater
   cleargs export other.spz -o other.ply            a scene file of any program
+  cleargs export room --capture room-data          frames and poses for nerfstudio, gsplat, Brush
 
 \b
 Formats:
@@ -71,8 +74,14 @@ Programs of --for:
 @click.option(
     "--crop",
     metavar="box:X,Y,Z,X,Y,Z|percentile:P",
-    help="Keep the Gaussians in a box. Give two corners in the coordinates of cameras.json, or P for the "
-    "middle P percent along each axis.",
+    help="Keep the Gaussians in a box. Give two corners in the coordinates of the file, which the report's "
+    "3D view shows, or P for the middle P percent along each axis.",
+)
+@click.option(
+    "--drop",
+    multiple=True,
+    metavar="sphere:X,Y,Z,R",
+    help="Leave out the Gaussians in a sphere, such as a floater. May be given several times.",
 )
 @click.option(
     "--spz",
@@ -102,6 +111,13 @@ Programs of --for:
 @click.option(
     "--cameras", is_flag=True, help="Also write FILE.cameras.json and the COLMAP model FILE.colmap."
 )
+@click.option(
+    "--capture",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Write the capture in place of the scene: frames, poses, points and split for nerfstudio, gsplat, "
+    "Brush and other trainers. Frames to which RVA gives no weight are left out.",
+)
 @click.option("--force", is_flag=True, help="Replace existing files.")
 @json_option
 @quiet_option
@@ -115,11 +131,17 @@ def export(
     outputs: tuple[Path, ...],
     as_json: bool,
     quiet: bool,
+    capture: Path | None,
     **options: Any,
 ) -> None:
     """Write the scene of RUN, or a scene file of any program, to one or several files."""
     from cleargs.render.export import ExportOptions, export_file, export_scene
 
+    if capture is not None:
+        if outputs or program:
+            raise InputError("--capture writes no scene", hint="give it without -o and --for")
+        _export_capture(run, capture, as_json)
+        return
     target = TARGETS[program] if program is not None else None
     if target is not None:
         name = run.resolve().name if run.is_dir() else run.name.split(".")[0]
@@ -128,7 +150,7 @@ def export(
             options[name] = getattr(target, name) if options[name] is None else options[name]
     if not outputs:
         raise InputError("no file is given", hint="give -o FILE, or --for PROGRAM")
-    given = ExportOptions(**{**options, "spz": options["spz"] or 3})
+    given = ExportOptions(**{**options, "spz": options["spz"] or 3}, views=program == "web")
     stage = None if run.is_file() and chosen is None else scene_stage(dag, run, chosen)
     if stage is None:
         lines = export_file(run, outputs, given)
@@ -137,3 +159,21 @@ def export(
     if target is not None:
         lines.append(f"{program}: {target.hint}")
     answer(as_json, {"files": list(map(str, outputs)), "stage": stage, "messages": lines}, *lines)
+
+
+def _export_capture(run: Path, folder: Path, as_json: bool) -> None:
+    """Write the frames of ``run`` for other trainers."""
+    from cleargs.handover import SPLIT
+    from cleargs.run_results import open_prepared, open_run
+    from cleargs.safe_io import read_json
+
+    found = open_run(run)
+    weights = found["rva"].weights() if "rva" in found.stages else None
+    made = open_prepared(found["ingest"]).to_nerfstudio(folder, weights)
+    split = read_json(made / SPLIT)
+    lines = [f"written: {made} ({len(split['train'])} frames for training, {len(split['test'])} held out)"]
+    lines.append(f"nerfstudio: ns-train splatfacto --data {quote(str(made))}")
+    every = split["test_every"]
+    options = f"--data_dir {quote(str(made))} --data_factor 1 --test_every {every or 1_000_000}"
+    lines.append(f"gsplat: python simple_trainer.py default {options}")
+    answer(as_json, {"folder": str(made), **split}, *lines)

@@ -31,6 +31,15 @@ def frame_rows(
     return found
 
 
+def score_text(score: str, value: float, settings: Mapping[str, Any]) -> str:
+    """Format R, B or G with two decimals, or with as many as tell it from the thresholds of `reason`."""
+    limits = [settings[f"{rule}_{score}"] for rule in ("tau", "auxiliary") if f"{rule}_{score}" in settings]
+    digits = 2
+    while digits < 6 and round(value, digits) in limits:
+        digits += 1
+    return f"{value:.{digits}f}"
+
+
 def short_name(name: str) -> str:
     """Return the end of a frame's name, which differs most between frames."""
     last = name.rpartition("/")[2]

@@ -13,6 +13,7 @@ import click
 from cleargs.cli.common import FILE, answer, json_option, run_argument
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
+from cleargs.named_views import VIEWS
 from cleargs.own_files import regular_files
 from cleargs.packed import PACK, Pack, require_images
 from cleargs.pipeline.dag import Dag
@@ -82,7 +83,7 @@ def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -
 
 
 def _files(run: Path, dag: Dag) -> Iterator[Path]:
-    yield from (run / name for name in (RUN_FILE, ENTRY) if (run / name).is_file())
+    yield from (run / name for name in (RUN_FILE, ENTRY, VIEWS) if (run / name).is_file())
     for folder in (run / FOLDER, run / EVAL):
         yield from regular_files(folder)
     for stage in linked_manifests(run, dag.names):

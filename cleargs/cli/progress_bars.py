@@ -21,7 +21,7 @@ from cleargs.files import disk_errors
 from cleargs.own_files import append_own
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE
-from cleargs.progress import CountedTask, ForwardingTask, LineReporter, Reporter, Say, Task
+from cleargs.progress import BothTasks, CountedTask, LineReporter, Reporter, Say, Task
 from cleargs.safe_io import open_own, printable
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class LoggingReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         with self._shown.task(label, total) as first, self._lines.task(label, total) as second:
-            yield ForwardingTask(first, total, lambda done, note, left: second.update(done=done, note=note))
+            yield BothTasks(first, second)
 
     def info(self, text: str) -> None:
         self._shown.info(text)

@@ -23,6 +23,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
+from cleargs.named_views import keep_views
 from cleargs.packed import read_pack, require_images
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import check_outputs
@@ -30,7 +31,7 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import opened_store
-from cleargs.report.report_json import ENTRY, is_current, linked_manifests, page_of
+from cleargs.report.report_json import ENTRY, is_current, is_own_page, linked_manifests, page_of
 
 
 @click.command(
@@ -46,6 +47,14 @@ Examples:
     "--single-file", is_flag=True, help="Also write the report as one HTML file, with everything inside."
 )
 @click.option("-o", "--output", type=FILE, help="File of --single-file.  [default: RUN/NAME-report.html]")
+@click.option(
+    "--view",
+    "views",
+    multiple=True,
+    metavar="NAME=X,Y,Z,X,Y,Z",
+    help="Keep a view of the scene (position, target) in RUN, for the report and `export --for web`. "
+    "The page prints this option. `start` is the first view; NAME= removes one.",
+)
 @open_option("Open the report in the browser.")
 @threads_option
 @store_option
@@ -57,6 +66,7 @@ def report(
     run: Path,
     single_file: bool,
     output: Path | None,
+    views: tuple[str, ...],
     opens: bool,
     threads: int,
     store: Path | None,
@@ -72,10 +82,15 @@ def report(
         if target.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"{target} does not end in .html", hint="name the file NAME.html")
         check_outputs([target], dag, run)
+        if target.exists() and not is_own_page(target):
+            raise InputError(f"{target} exists and is not a report of ClearGS", hint="choose another name")
     from cleargs.report.page import write_report
     from cleargs.report.single_file import write_single_file
 
     settings = read_run_file(run, dag, store=store)
+    if views:
+        require_images(run, "a report with other views")
+        keep_views(settings.folder, views)
     page = page_of(settings.folder)
     if read_pack(run) and page.is_file():
         click.echo("note: this is the report as it was packed; without images no other is possible", err=True)

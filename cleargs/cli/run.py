@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -43,6 +44,7 @@ from cleargs.errors import StageError
 from cleargs.packed import WORKS, read_pack
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.live import stage_at_work
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_text
 from cleargs.pipeline.run_file import RUN_FILE, RUN_LOG, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
@@ -184,7 +186,8 @@ def run(
             check_same_input(settings, dag, opened)
             runner = Runner(dag, settings, opened, threads, reporter)
             if dry_run:
-                print_plans(runner.plan(until, tuple(dag.check(name) for name in force)), as_json)
+                plans = runner.plan(until, tuple(dag.check(name) for name in force))
+                print_plans(plans, as_json, settings.stages(dag))
                 return 0
             log(
                 f"cleargs {cleargs.__version__}, {settings.device}, {threads} threads, store {settings.store}"
@@ -294,7 +297,11 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
         click.echo(as_called(note), err=True)
         return
     with opened_store(settings.store) as opened:
-        print_plans(Planner(dag, settings, opened, usable_cores(), make_reporter()).plan(), as_json)
+        plans = Planner(dag, settings, opened, usable_cores(), make_reporter()).plan()
+    if at_work := stage_at_work(settings.folder, settings.store):
+        name, text = at_work
+        plans = [replace(plan, reasons=(text,)) if plan.stage == name else plan for plan in plans]
+    print_plans(plans, as_json, settings.stages(dag))
 
 
 def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:
@@ -385,14 +392,18 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
     return f"cleargs export {quote(str(run))} -o {quote(f'{run.absolute().name}.sog')}"
 
 
-def print_plans(plans: list[StagePlan], as_json: bool) -> None:
-    """Print the state and cost of each stage, with its reasons, then the cost of all."""
+def print_plans(plans: list[StagePlan], as_json: bool, stages: Sequence[str] = ()) -> None:
+    """Print the state and cost of each stage, with its reasons, then the cost of all.
+
+    ``stages`` are those that have work (none given: all). JSON also has the others.
+    """
     lines, facts = [], []
     for plan in plans:
         first, *others = plan.reasons or ("",)
         cost = cost_text(plan.estimate) if plan.estimate is not None else ""
-        lines.append(f"{plan.stage:<12} {plan.state:<8} {cost:<37} {first}".rstrip())
-        lines += [f"{'':<59} {reason}" for reason in others]
+        if not stages or plan.stage in stages:
+            lines.append(f"{plan.stage:<12} {plan.state:<8} {cost:<37} {first}".rstrip())
+            lines += [f"{'':<59} {reason}" for reason in others]
         figures = ("minutes", "memory_gb", "disk_gb")
         estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}
         known = {"stage": plan.stage, "state": plan.state, "key": plan.key, "reasons": list(plan.reasons)}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import textwrap
 from dataclasses import asdict
 
 import click
@@ -23,25 +25,19 @@ Examples:
 @json_option
 @click.pass_obj
 def settings(dag: Dag, stage: str | None, as_json: bool) -> None:
-    """List all settings, or those of one STAGE, with default, range and meaning."""
+    """List all settings, or those of one STAGE: name = default, range, meaning."""
     names = dag.names if stage is None else (dag.check(stage),)
     found = {name: settings_of(name, dag.load(name).CONFIG) for name in names}
     if as_json:
         print_json([asdict(setting) for settings in found.values() for setting in settings])
         return
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console(highlight=False)
-    for name, settings in found.items():
-        table = Table(box=None, header_style="bold", padding=(0, 1, 0, 0), pad_edge=False)
-        table.add_column(f"{name}.", no_wrap=True)
-        table.add_column("default", max_width=14, overflow="fold")
-        table.add_column("range", max_width=26)
-        table.add_column("meaning")
-        for setting in settings:
-            field = setting.name.removeprefix(f"{name}.")
-            table.add_row(*map(Text, (field, setting.default_text, setting.allowed, setting.meaning)))
-        console.print(table)
-        console.print()
+    width = max(40, shutil.get_terminal_size().columns)
+    for setting in (setting for settings in found.values() for setting in settings):
+        allowed = f"  ({setting.allowed})" if setting.allowed else ""
+        for text, indent in (
+            (f"{setting.name} = {setting.default_text}{allowed}", ""),
+            (setting.meaning, "    "),
+        ):
+            lines = textwrap.wrap(text, width, initial_indent=indent, subsequent_indent="    ")
+            click.echo("\n".join(lines))
+        click.echo()

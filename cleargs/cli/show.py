@@ -23,7 +23,7 @@ from cleargs.cli.common import (
     print_json,
     run_argument,
 )
-from cleargs.cli.frame_rows import frame_rows, reason, short_name
+from cleargs.cli.frame_rows import frame_rows, reason, score_text, short_name
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.packed import WORKS, read_pack
@@ -75,6 +75,7 @@ Examples:
   cleargs show room                 all stages: state, time, size, figures
   cleargs show room rva             role and weight of each frame, and why
   cleargs show room rva --columns   the columns of the tables, with their meanings
+  cleargs show room scene           the box that holds the scene, for export --crop
   cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
 )
@@ -88,6 +89,7 @@ Examples:
     help="Show all facts about frame N, and write a picture of its layers.",
 )
 @click.option("-o", "--output", type=FILE, help="File of --frame (.png).  [default: RUN/frame-N.png]")
+@click.option("--force", is_flag=True, help="Replace an existing file of --output.")
 @json_option
 @click.pass_obj
 def show(
@@ -97,6 +99,7 @@ def show(
     columns: bool,
     frame: int | None,
     output: Path | None,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Show the results of the stages of RUN, or the tables of one STAGE."""
@@ -112,13 +115,15 @@ def show(
     done = linked_manifests(run, dag.names)
     if frame is not None:
         picture = output or run / f"frame-{frame:06d}.png"
-        check_outputs([picture], dag, run)
+        check_outputs([picture], dag, run, force=force or output is None)
         _show_frame(run, done, frame, None if read_pack(run) else picture, as_json)
     elif stage is None:
         if as_json:
             print_json({name: manifest_json(done[name]) if name in done else None for name in dag.names})
         else:
-            _print_run(settings, {name: done.get(name) for name in dag.names})
+            _print_run(settings, {name: done.get(name) for name in settings.stages(dag)})
+    elif stage == "scene":
+        _show_extent(dag, run, as_json)
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     else:
@@ -143,10 +148,22 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
     elif None in manifests.values():
         click.echo(as_called(f"not done: see cleargs status {quote(str(run.folder))}"))
     if work := running_stage(run.folder, run.store):
-        count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
-        click.echo(f"\n{work.stage} is running: {', '.join(filter(None, (work.label, count, work.note)))}")
+        click.echo(f"\n{work.stage} is running: {work.words}")
         if preview := preview_of(work, run.store):
             click.echo(f"preview: {preview.path}")
+
+
+def _show_extent(dag: Dag, run: Path, as_json: bool) -> None:
+    """Print the scene's box, in the coordinates of the exports that turn nothing."""
+    from cleargs.render.pruning import extent_text
+    from cleargs.run_results import scene_path, scene_stage
+    from cleargs.splat.ply import read_ply
+
+    stage = scene_stage(dag, run, None)
+    scene = read_ply(scene_path(run, stage))
+    low, high = scene.gaussians.means.amin(0).tolist(), scene.gaussians.means.amax(0).tolist()
+    facts = {"stage": stage, "gaussians": scene.gaussians.num, "low": low, "high": high}
+    answer(as_json, facts, f"scene of {stage}: {scene.gaussians.num} Gaussians", extent_text(scene))
 
 
 def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bool, as_json: bool) -> None:
@@ -173,8 +190,12 @@ def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bo
     _print_table(lines, title=f"{stage}: {manifest.status}")
     if frames is not None and not columns:
         click.echo()
-        named = ((row | {"name": short_name(row["name"])}).values() for row in frames)
-        cells = ([f"{x:.2f}" if isinstance(x, float) else text_of(x) for x in row] for row in named)
+        named = ((row | {"name": short_name(row["name"])}).items() for row in frames)
+        config = manifest.parts.config
+        cells = (
+            [score_text(key, x, config) if isinstance(x, float) else text_of(x) for key, x in row]
+            for row in named
+        )
         _print_table(cells, *frames[0] if frames else (), wraps="reason")  # fits in 80 columns
     for name, fields in described.items() if columns else ():
         title = f"\n{name}: {tables[name].num_rows} rows"
@@ -259,7 +280,8 @@ def _show_frame(
         "picture": None if picture is None else str(picture),
     }
     if not as_json:
-        _print_table(_lines(row, facts), title=f"frame {number}")
+        config = done["rva"].parts.config if rated else {}
+        _print_table(_lines(row, facts, config), title=f"frame {number}")
     answer(as_json, facts, f"written: {picture}" if picture else "no picture: a packed run has no images")
 
 
@@ -289,11 +311,13 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     return shown
 
 
-def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield label and text of each line about a frame. ``--json`` prints more facts."""
+def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield label and text of each line about a frame; ``settings`` of RVA. ``--json`` prints more facts."""
     from cleargs.report.frames import CHOICES, EFFECTS, scores_of
 
     frame, rated = row.frame, facts["rva"]
+    if row.weight_text:
+        yield "counts", row.weight_text
     yield "file", frame.name
     if frame.time_s is not None:
         yield "time", f"{frame.time_s:.2f} s"
@@ -305,9 +329,9 @@ def _lines(row: FrameRow, facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]
     else:
         yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
     if rated:
-        yield "role", f"{rated['role']}, weight {row.weight:.2f}: {rated['reason']}"
+        yield "role by RVA", f"{rated['role']}, weight {rated['weight']:.2f}: {rated['reason']}"
         known = ((name, rated[name]) for name in ("R", "B", "G") if rated[name] is not None)
-        yield "scores", ", ".join(f"{name} {value:.2f}" for name, value in known)
+        yield "scores", ", ".join(f"{name} {score_text(name, value, settings)}" for name, value in known)
         yield "worst cue", rated["worst_cue"] or "none"
     if found := row.formation:
         if found["model"] == "none":

@@ -14,7 +14,7 @@ from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.files import remove
 from cleargs.manifest import MANIFEST, Manifest, damages, has_results, read_manifest
-from cleargs.own_files import leftovers, size_of
+from cleargs.own_files import leftovers, refuse_links, size_of
 from cleargs.packed import read_pack
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import SCENE, RunSpec, read_run_file
@@ -51,6 +51,8 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
     faults: list[StoreFault] = []
     stages: list[str] = []
     files, left_out, packed = 0, 0, read_pack(settings.folder)
+    if packed is not None:
+        refuse_links([settings.folder / SCENE])
     with opened_store(settings.store) as opened:
         for name in dag.names:
             folder = settings.folder / name
@@ -157,7 +159,8 @@ def gc(
         if run is not None and not dry_run:
             opened.add_root(run.absolute())
         found = opened.collect(dag.names, checkpoints=checkpoints, dry_run=True)
-        partial = [Garbage(path, "rubbish", size_of(path)) for path in (leftovers(run) if run else ())]
+        places = (root, root / ROOTS, *([run] if run else []))
+        partial = [Garbage(path, "rubbish", size_of(path)) for place in places for path in leftovers(place)]
         garbage = [*found, *partial]
         lines = [_sized(item.bytes, f"{item.kind:<10}  {_name(item.folder, opened)}") for item in garbage]
         size = sum(item.bytes for item in garbage)

@@ -44,15 +44,46 @@ class RunningStage(FrozenModel):
     """A few figures: PSNR, Gaussians."""
     seconds_left: float | None = None
     """Time left for the current task."""
+    begun: float = 0.0
+    """Start of the current task, in seconds since 1970."""
+
+    @property
+    def words(self) -> str:
+        """The task, its steps and its figures, for example "G0, 130 of 800, training PSNR 24.10 dB"."""
+        count = f"{self.done} of {self.total}" if self.total else str(self.done or "")
+        return ", ".join(filter(None, (self.label, count, self.note)))
+
+
+def _last_stage(run: Path) -> RunningStage | None:
+    try:
+        return RunningStage.model_validate(read_json(run / PROGRESS_FILE, MAX_BYTES, root=run))
+    except FAULTS:  # ValidationError is a ValueError
+        return None
 
 
 def running_stage(run: Path, store: Path) -> RunningStage | None:
     """Return the progress of the run in the folder ``run``; None if no process is running it."""
-    try:
-        found = RunningStage.model_validate(read_json(run / PROGRESS_FILE, MAX_BYTES, root=run))
-    except FAULTS:  # ValidationError is a ValueError
+    found = _last_stage(run)
+    return found if found is not None and writer_is_alive(store / "work" / found.work) else None
+
+
+def stage_at_work(run: Path, store: Path, *, stopped: bool = False) -> tuple[str, str] | None:
+    """Return the stage that works or stopped before its end, and what it does or did; None without one.
+
+    With ``stopped``, the caller is the process that worked, and stops.
+    """
+    found = _last_stage(run)
+    if found is None:
         return None
-    return found if writer_is_alive(store / "work" / found.work) else None
+    work = store / "work" / found.work
+    if work.parent.is_symlink() or work.is_symlink() or not work.is_dir():
+        return None
+    if not stopped and writer_is_alive(work):
+        return found.stage, f"running: {found.words}, for {max(0.0, time.time() - found.begun):.0f} s"
+    nodes = nodes_below(work / "checkpoints")
+    saved = any(node.name != PREVIEW and node.is_file(follow_symlinks=False) for node in nodes)
+    kept = "continues from its last checkpoint" if saved else "has no checkpoint yet"
+    return found.stage, f"stopped at {found.words}; {kept}"
 
 
 class Preview(NamedTuple):
@@ -77,40 +108,56 @@ def preview_of(found: RunningStage, store: Path) -> Preview | None:
 def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[RecordingReporter]:
     """Yield a reporter that forwards to ``reporter`` and writes the progress of ``stage`` into ``run``.
 
-    ``work`` is the work folder of the stage in the store. The progress file is removed when the block ends.
+    ``work`` is the work folder of the stage in the store. The progress file is removed when the block ends,
+    and stays with the last state if the stage stops before its end.
     """
     path = run / PROGRESS_FILE
+    first = RunningStage(stage=stage, work=work.name, label=stage, begun=time.time())
+    recorder = RecordingReporter(reporter, path, first)
     try:
-        yield RecordingReporter(reporter, path, RunningStage(stage=stage, work=work.name, label=stage))
-    finally:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+        yield recorder
+    except BaseException as error:
+        recorder.write()
+        if isinstance(error, KeyboardInterrupt) and (
+            found := stage_at_work(run, work.parent.parent, stopped=True)
+        ):
+            reporter.info(": ".join(found))
+        raise
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 class RecordingReporter:
     """Forward to a reporter, and write the task that advanced last to the progress file."""
 
     def __init__(self, reporter: Reporter, path: Path, first: RunningStage) -> None:
-        self._reporter, self._path, self._first = reporter, path, first
+        self._reporter, self._path, self._state = reporter, path, first
         self.info, self.warn = reporter.info, reporter.warn
-        self._write(first)
+        self.write()
         self.compile_seconds = 0.0
         """Seconds in tasks called `COMPILING`."""
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        task_of = {"label": label, "total": total, "begun": time.time()}
+
         def show(done: int, note: str, left: float | None) -> None:
+            now = {**task_of, "done": done, "note": note, "seconds_left": left}
+            self._state = self._state.model_copy(update=now)
             if time.monotonic() - self._written >= WRITE_INTERVAL_S:
-                now = {"label": label, "total": total, "done": done, "note": note, "seconds_left": left}
-                self._write(self._first.model_copy(update=now))
+                self.write()
 
         begun = time.monotonic()
+        show(0, "", None)
+        if total is None:  # nothing may come until its end
+            self.write()
         with self._reporter.task(label, total) as task:
             yield ForwardingTask(task, total, show)
         if label == COMPILING:
             self.compile_seconds += time.monotonic() - begun
 
-    def _write(self, state: RunningStage) -> None:
+    def write(self) -> None:
+        """Write the present state."""
         self._written = time.monotonic()
         with suppress(StoreError):
-            write_json(self._path, state.model_dump())
+            write_json(self._path, self._state.model_dump())

@@ -9,12 +9,13 @@ from os.path import realpath
 from pathlib import Path
 
 from cleargs.errors import CleargsError, InputError
+from cleargs.named_views import VIEWS
 from cleargs.packed import PACK
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, known_metadata, read_run_file
 from cleargs.pipeline.store import ROOTS, STORE_FOLDER
 
-OWN = (RUN_FILE, SCENE, LOCK, PACK, STORE_FOLDER, "run.log", "report.html", "report")
+OWN = (RUN_FILE, SCENE, LOCK, PACK, STORE_FOLDER, "run.log", VIEWS, "report.html", "report")
 """Files and folders that every run has, in addition to the results of its stages."""
 
 NEAR = 4

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import shutil
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +34,9 @@ Measured with 12 frames of 240x136 (estimate 1.1 GB): a limit of 4.0 GB is too l
 
 WORTH_MEASURING_MIN = 2.0
 """Expected work, in minutes, from which measuring the speed of this machine is worth its seconds."""
+
+STEADY_S = 20.0
+"""Seconds that are added to measured and expected times before they are compared."""
 
 NO_RESULTS = "no results yet"
 """Reason of a stage that never had results in this run."""
@@ -187,12 +191,26 @@ class Planner:
         costs = [plan.estimate.minutes for plan in plans if plan.estimate is not None]
         if self.run.device != "cpu" or sum(costs) < WORTH_MEASURING_MIN:
             return plans
-        before, self.pace = self.pace, self.dag.pace(self.reporter.info)
+        with ExitStack() as tasks:
+            announced = lambda text: tasks.enter_context(self.reporter.task(text))  # noqa: E731
+            before, self.pace = self.pace, self.dag.pace(announced)
         factor = self.pace / before
         return [
             plan if plan.estimate is None else replace(plan, estimate=plan.estimate.at_pace(factor))
             for plan in plans
         ]
+
+    def pace_of(self, made: Mapping[str, Manifest]) -> float:
+        """Return the time that the stages ``made`` took by their estimates, at least a half.
+
+        Short stages count little, and so do those whose results were quickly at hand.
+        """
+        taken = expected = STEADY_S
+        for name, manifest in made.items():
+            before = {one: made[one] for one in self.dag.load(name).INPUTS if one in made}
+            taken += manifest.seconds
+            expected += 60.0 * self.estimate(name, before).minutes
+        return max(0.5, taken / expected)
 
     def estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
         """Estimate the cost of ``name`` on this machine from its settings and finished upstream stages."""
@@ -320,7 +338,7 @@ def cost_line(plans: list[StagePlan]) -> str:
         max(cost.memory_gb for _, cost in costs),
         sum(cost.disk_gb for _, cost in costs),
     )
-    stages = ", ".join(f"{stage} {_time(cost.minutes)}" for stage, cost in costs)
+    stages = ", ".join(f"{stage} {_time(cost.minutes)}" for stage, cost in costs if cost.minutes)
     return f"estimate: about {cost_text(whole)} ({stages})"
 
 

@@ -10,6 +10,7 @@ import tomli_w
 
 from cleargs.errors import ConfigError, InputError, StoreError
 from cleargs.files import disk_errors, write_bytes
+from cleargs.named_views import VIEWS
 from cleargs.own_files import nodes_below, refuse_links
 from cleargs.pipeline.config import Config, Document, check_document, known_settings, read_toml
 from cleargs.pipeline.dag import Dag
@@ -30,7 +31,7 @@ RUN_LOG = "run.log"
 LOCK = ".lock"
 """Lock file of the process that works in the run folder."""
 
-OWN_NAMES = (RUN_FILE, LOCK, RUN_LOG, EVAL, ".at_work.json", "report", "report.html")
+OWN_NAMES = (RUN_FILE, LOCK, RUN_LOG, EVAL, ".at_work.json", VIEWS, "report", "report.html")
 """Files and folders in a run that ClearGS reads or writes, apart from those of the stages."""
 
 HEADER = """\
@@ -58,6 +59,11 @@ class RunSpec:
     """Stages that run on the CPU although `device` is the GPU, because its kernels failed there."""
     falls_back: bool = field(default=False, compare=False)
     """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
+
+    def stages(self, dag: Dag) -> tuple[str, ...]:
+        """Return the stages that have work with the settings of the run: a draft has no repairs."""
+        idle = {name: getattr(dag.load(name), "idle", None) for name in dag.names}
+        return tuple(name for name, check in idle.items() if not (check and check(self.config.effective)))
 
     def device_of(self, stage: str) -> Device:
         return "cpu" if stage in self.on_cpu else self.device

@@ -28,11 +28,13 @@ from cleargs.manifest import (
     versions,
     write_manifest,
 )
+from cleargs.own_files import drop_links
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import exclusive_lock
 from cleargs.pipeline.plan import (
     NO_RESULTS,
+    STEADY_S,
     Planner,
     StageKey,
     StagePlan,
@@ -43,6 +45,9 @@ from cleargs.pipeline.plan import (
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, known_metadata, write_run_file
 from cleargs.pipeline.store import Entry, Store, copied_key
+
+BUSY = 1.5
+"""Time by the clock divided by processor time from which other programs are named as the cause."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,7 @@ class Runner(Planner):
                 self.reporter.info(line)
         outcomes: list[StageOutcome] = []
         done: dict[str, Manifest] = {}
+        made: dict[str, Manifest] = {}
         lock = exclusive_lock(self.run.folder / LOCK, self.reporter, self.run.folder.name)
         with lock, self.store.in_use():
             check_same_input(self.run, self.dag, self.store)
@@ -93,8 +99,9 @@ class Runner(Planner):
                 outcomes.append(outcome)
                 if outcome.how == "made":
                     self._unlink_outdated()
-                if name == self.dag.names[0] and outcome.how == "made":
-                    self._revise(plans[1:], done)
+                if outcome.how == "made":
+                    made[name] = outcome.manifest
+                    self._revise([plan for plan in plans if plan.stage not in done], done, made)
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
             if os.path.lexists(self.run.folder / SCENE) and not self._has_scene_link():
@@ -128,15 +135,29 @@ class Runner(Planner):
         link = self.run.folder / SCENE
         return link.is_symlink() and link.readlink() in [Path(name, SCENE) for name in self.dag.names]
 
-    def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
-        """Report the cost of the remaining stages again: it is better known once the capture is read."""
+    def _revise(
+        self, plans: Sequence[StagePlan], done: Mapping[str, Manifest], made: Mapping[str, Manifest]
+    ) -> None:
+        """Report the cost of the remaining stages again, from what was read and how long it took.
+
+        The first stage depends more on the capture than on the machine. Its time counts only where other
+        programs took the processor.
+        """
+        last = list(made.values())[-1]
+        wall, own = last.seconds + last.compile_seconds, last.cpu_seconds or 0.0
+        # Alone, a stage gets at least the time of one core.
+        busy = wall > BUSY * own and wall > STEADY_S
+        pace = self.pace_of(made) if busy or len(made) > 1 else 1.0
         costs = [
-            replace(plan, estimate=self.estimate(plan.stage, done))
+            replace(plan, estimate=self.estimate(plan.stage, done).at_pace(pace))
             for plan in plans
             if plan.estimate is not None
         ]
         if line := cost_line(costs):
-            self.reporter.info(f"new {line}")
+            note = (
+                f"; other programs are busy: {last.stage} got {own:.0f} s of processor time in {wall:.0f} s"
+            )
+            self.reporter.info(f"new {line}{note if busy else ''}")
 
     def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and link them into the run folder.
@@ -221,6 +242,7 @@ class Runner(Planner):
             stage_key.parts.key, forced=forced, entry=entry, leftovers=stage.LEFTOVERS, locked=locked
         )
         context = self.context(name, stage_key.inputs, work)
+        drop_links(context.cache, in_place=context.cache)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
         try:

@@ -101,7 +101,8 @@ class Stage(Protocol):
 
     A stage may also have a function ``other_libraries(device, config)``, which returns name -> version of
     those that only this device or these settings use. It may have a function ``effective(config, sections)``,
-    which returns its settings as those of other stages change them.
+    which returns its settings as those of other stages change them, and a function ``idle(sections)``, which
+    is True if the settings leave it nothing to do.
     """
 
     def externals(self, config: Any, source: Path) -> Mapping[str, External]:

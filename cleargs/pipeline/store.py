@@ -418,7 +418,9 @@ def copied_key(link: Path) -> str | None:
 def writer_is_alive(work: Path) -> bool:
     """Return True if a process is using the work folder ``work``."""
     key = work.name.partition("@")[0].removesuffix(".forced")
-    return work.is_dir() and not work.is_symlink() and is_locked(work.parent.parent / "locks" / f"{key}.lock")
+    locks = work.parent.parent / "locks"
+    linked = any(place.is_symlink() for place in (work.parent, work, locks))  # in a run of another person
+    return not linked and work.is_dir() and is_locked(locks / f"{key}.lock")
 
 
 def _is_cached(file: Path) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Similarity
 from cleargs.capture.model import read_model, transform_model, write_model
@@ -19,10 +20,11 @@ from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_bytes, write_json
 from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
+from cleargs.named_views import NamedView, read_views
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
-from cleargs.render.pruning import crop_scene, parse_crop, parse_prune, prune_scene
+from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.run_results import scene_path
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
@@ -45,12 +47,15 @@ class ExportOptions:
     sh_degree: int | None = None
     prune: Sequence[str] = ()
     crop: str | None = None
+    drop: Sequence[str] = ()
     cameras: bool = False
     """Write cameras and COLMAP model too."""
     force: bool = False
     """Replace existing files."""
     spz: SpzVersion = 3
     """Version of .spz files."""
+    views: bool = False
+    """Write the named views of the run, if it has some, next to the first file."""
 
 
 def export_scene(
@@ -78,7 +83,7 @@ def export_scene(
     if options.world == "input" and (offset := far_offset(scene.gaussians, similarity)):
         similarity["translation"] = similarity["translation"] - np.array(offset)
         file = outputs[0].with_name(f"{_stem(outputs[0])}.offset.json")
-        check_outputs([file], installed(), run)
+        check_outputs([file], installed(), run, force=options.force)
         write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
         messages.append(
             "single precision would round positions so far from the origin: the files are written without "
@@ -89,6 +94,11 @@ def export_scene(
     scene, cropped = _cropped(scene, options)
     for output in outputs if options.cameras else ():
         _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
+    if options.views and (views := read_views(run)):
+        file = outputs[0].with_name(f"{_stem(outputs[0])}.views.json")
+        check_outputs([file], installed(), run, force=options.force)
+        write_json(file, views_json(views, next(iter(cameras.values()))[1], **similarity))
+        messages.append(f"{file}: {len(views)} views")
     axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
     written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {stage}, {axes}")
     return [*messages, *cropped, *written]
@@ -122,12 +132,16 @@ def _kinds(outputs: Sequence[Path], options: ExportOptions) -> list[str]:
     for kind in kinds:
         check_up(kind, options.up)
     parse_crop(options.crop)
+    parse_drop(options.drop)
     return kinds
 
 
 def _cropped(scene: Scene, options: ExportOptions) -> tuple[Scene, list[str]]:
-    """Return the scene in the box of the options, and messages. Raises InputError if nothing is left."""
-    messages = []
+    """Return the scene in the box of the options, and messages. Raises InputError if nothing is left.
+
+    Boxes and spheres are in the coordinates of the file.
+    """
+    scene, messages = drop_spheres(scene, parse_drop(options.drop))
     if (region := parse_crop(options.crop)) is not None:
         scene, message = crop_scene(scene, region)
         messages.append(message)
@@ -183,6 +197,32 @@ def _similarity(
         factor = wanted / (apart * similarity["scale"])
         similarity |= {name: factor * similarity[name] for name in ("scale", "translation")}
     return similarity
+
+
+def views_json(
+    views: Sequence[NamedView],
+    camera: Camera,
+    scale: float = 1.0,
+    rotation: NDArray[np.float64] | None = None,
+    translation: NDArray[np.float64] | None = None,
+) -> list[dict[str, Any]]:
+    """Return name, position, target, up and horizontal field of view (degrees, of ``camera``) of each view.
+
+    They are in the world of the file: x -> scale rotation x + translation.
+    """
+    turn = np.eye(3) if rotation is None else rotation
+    shift = np.zeros(3) if translation is None else translation
+    fov = float(np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx)))
+    return [
+        {
+            "name": view.name,
+            "position": (scale * turn @ view.position + shift).tolist(),
+            "target": (scale * turn @ view.target + shift).tolist(),
+            "up": (turn @ [0.0, -1.0, 0.0]).tolist(),
+            "fov": fov,
+        }
+        for view in views
+    ]
 
 
 def _write_sidecars(

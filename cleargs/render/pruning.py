@@ -30,6 +30,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import TrainingView
 
+DROP_HINT = "give sphere:X,Y,Z,R with a radius R above 0"
 PRUNE_HINT = "give opacity:O with O from 0 to 1, or contribution:P with P in pixels"
 CROP_HINT = "give box:X,Y,Z,X,Y,Z with the lower corner first, or percentile:P with P above 0 and up to 100"
 
@@ -57,6 +58,44 @@ def parse_crop(rule: str | None) -> tuple[float, ...] | None:
     if not values or not (all(map(lt, low, high)) if kind == "box" else 0.0 < values[0] <= 100.0):
         raise InputError(f"--crop {rule} is not valid", hint=CROP_HINT)
     return values
+
+
+def parse_drop(rules: Sequence[str]) -> list[tuple[float, ...]]:
+    """Return centre and radius (four numbers) of each sphere. Raises InputError."""
+    spheres = []
+    for rule in rules:
+        _, values = _parsed(rule, sphere=4)
+        if not values or values[3] <= 0.0:
+            raise InputError(f"--drop {rule} is not valid", hint=DROP_HINT)
+        spheres.append(values)
+    return spheres
+
+
+def drop_spheres(scene: Scene, spheres: Iterable[tuple[float, ...]]) -> tuple[Scene, list[str]]:
+    """Return the scene without the Gaussians whose centres are in a sphere of `parse_drop`, and messages."""
+    messages = []
+    for *centre, radius in spheres:
+        away = torch.linalg.vector_norm(scene.gaussians.means - torch.tensor(centre), dim=1) > radius
+        if away.all():
+            raise InputError(
+                f"no Gaussian is in the sphere {_numbers((*centre, radius))}", hint=extent_text(scene)
+            )
+        messages.append(f"dropped {int((~away).sum())} Gaussians in the sphere {_numbers((*centre, radius))}")
+        scene = replace(scene, gaussians=scene.gaussians.select(away))
+    return scene, messages
+
+
+def extent_text(scene: Scene) -> str:
+    """Return the box of all centres, and of their 1 to 99 % along each axis, in the form of ``--crop``."""
+    means = scene.gaussians.means
+    if not len(means):
+        return "the scene is empty"
+    whole, most = (means.amin(0).tolist() + means.amax(0).tolist(), np.concatenate(central_box(means, 98.0)))
+    return f"the scene is in box:{_numbers(whole)}, its 1 to 99 % in box:{_numbers(most)}"
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ",".join(f"{value:.4g}" for value in values)
 
 
 def _parsed(rule: str, **counts: int) -> tuple[str, tuple[float, ...]]:
@@ -118,7 +157,9 @@ def crop_scene(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
     else:
         low, high = np.array(region[:3]), np.array(region[3:])
     smaller = scene.gaussians.select(inside(means, low, high))
-    box = ",".join(f"{value:.4g}" for value in (*low, *high))
+    box = _numbers((*low, *high))
+    if not smaller.num:
+        raise InputError(f"no Gaussian is left in the box {box}", hint=extent_text(scene))
     return replace(scene, gaussians=smaller), (
         f"cropped to the box {box}: {means.shape[0] - smaller.num} of {means.shape[0]} Gaussians are outside"
     )

@@ -26,15 +26,12 @@ from cleargs.program import program
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
-from cleargs.report.outcome import figure_of
-from cleargs.splat.config import steps_from_frames
+from cleargs.report.outcome import figure_of, short_training
 
 FEW_PLACED = 0.8
 """Share of frames with a pose below which the report gives advice on the other frames."""
 BLURRED_PX = 6.0
 """Motion blur above which a frame counts as blurred, px."""
-SHORT = 0.8
-"""A training with a smaller share of the standard steps counts as short."""
 NO_FIGURE = "not measured"
 
 
@@ -69,7 +66,9 @@ def shown_advice(
     if not any(advice.options and advice.worth for advice in found):
         found = [advice for advice in found if advice.worth]
     return [
-        advice._replace(command=_command(planner.run, advice.options), time=_time(planner, advice.options))
+        advice._replace(
+            command=_command(planner.run, advice.options), time=_time(planner, advice.options, manifests)
+        )
         if advice.options
         else advice
         for advice in found
@@ -118,8 +117,8 @@ def toml_text(value: Any) -> str:
     return " ".join(tomli_w.dumps({"v": value}).removeprefix("v = ").split())
 
 
-def _time(planner: Planner, options: Sequence[str]) -> str:
-    """Return the expected time of the run with ``options``; "" if it is unknown."""
+def _time(planner: Planner, options: Sequence[str], manifests: Mapping[str, Manifest]) -> str:
+    """Return the expected time of the run with ``options``, by that of the run; "" if it is unknown."""
     given = [
         f"g0.quality={value}" if option == "--quality" else value
         for option, value in pairwise(options)
@@ -130,9 +129,10 @@ def _time(planner: Planner, options: Sequence[str]) -> str:
         run = replace(planner.run, config=load_config(planner.dag, kept, given))
         changed = Planner(planner.dag, run, planner.store, planner.threads, SilentReporter())
         costs = [plan.estimate.minutes for plan in changed.plan() if plan.estimate is not None]
+        minutes = sum(costs) * planner.pace_of(manifests)
     except CleargsError:  # the capture was deleted or moved
         return ""
-    return f"about {max(1, round(sum(costs)))} min" if costs else ""
+    return f"about {max(1, round(minutes))} min" if costs else ""
 
 
 def _on_frames(
@@ -168,7 +168,8 @@ def _on_frames(
     if rows and not any(row.role == HELD_OUT for row in rows):
         yield Advice(
             "No frame was held out",
-            "All figures here are for frames that the scene was trained on.",
+            "The PSNR at the top is for other pixels of the frames that the scene was trained on. "
+            "New views are worse; no figure here says by how much.",
             "no better scene, but a figure for new views",
             0.0,
             ("--set", "ingest.holdout=every:8"),
@@ -185,17 +186,15 @@ def _on_training(
 ) -> Iterator[Advice]:
     config = planner.run.config
     g0: Any = config.sections["g0"]
-    ingest: Any = config.sections["ingest"]
+    ingest: Any = config.effective["ingest"]
     size = ingest.max_size
-    steps = figure_of(manifests, "g0", "steps") or 0
-    standard = steps_from_frames(sum(bool(row.weight) for row in rows))
     recipe, changed = _nearest_recipe(config, planner.dag)
     named = g0.steps is not None or recipe != "default"
-    if steps < SHORT * standard:
+    if short := short_training(manifests, rows):
         own = {name: value for name, value in changed.items() if name.startswith(("ingest.", "rva."))}
         reset = ("--reset", *_set(own)) if named else ()
         yield Advice(
-            f"The training was short: {steps:,} of {standard:,} steps at {size} px",
+            f"The training was short: {short[0]:,} of {short[1]:,} steps at {size} px",
             "Longer training gives finer detail.",
             "+0.8 to 2.2 dB at new views (draft against standard, four captures)",
             1.5,
@@ -209,7 +208,7 @@ def _on_training(
             0.6,
             ("--quality", "high"),
         )
-    if steps >= SHORT * standard and any(size in (row.frame.width, row.frame.height) for row in rows):
+    if not short and any(size in (row.frame.width, row.frame.height) for row in rows):
         why = "Larger images show finer detail, if the video has it."
         larger = tuple(_set({"ingest.max_size": size * 3 // 2}))
         yield Advice(f"Images were reduced to {size} px", why, NO_FIGURE, 0.5, larger)

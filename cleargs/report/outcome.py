@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 from cleargs.manifest import Manifest
 from cleargs.report.formatting import count
 from cleargs.report.frames import SCENES, FrameRow
+from cleargs.splat.config import steps_from_frames
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
 """PSNR from which the scene matches the frames closely, and below which it does so loosely. The PSNR of a
@@ -20,10 +21,13 @@ good scene depends on the noise and the texture of the capture."""
 
 Tone = Literal["good", "fair", "poor"]
 
+SHORT = 0.8
+"""A training with a smaller share of the standard steps counts as short."""
+
 HEADLINES: Mapping[Tone, str] = {
-    "good": "Good: the scene matches the video closely.",
-    "fair": "Fair: the scene matches the video reasonably well.",
-    "poor": "Poor: the scene matches the video only loosely.",
+    "good": "Good: the scene matches the {source} closely{after}.",
+    "fair": "Fair: the scene matches the {source} reasonably well{after}.",
+    "poor": "Poor: the scene matches the {source} only loosely{after}.",
 }
 
 
@@ -55,7 +59,17 @@ def outcome(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen:
         headline = "The scene is trained." if trained else "The capture is prepared. No scene is trained yet."
         return Outcome("fair", headline, text, "")
     tone: Tone = "good" if psnr >= CLOSE_DB else "fair" if psnr >= LOOSE_DB else "poor"
-    return Outcome(tone, HEADLINES[tone], text, f"{psnr:.1f}")
+    filmed = any(row.frame.time_s is not None for row in rows)
+    after = " after a short training" if short_training(manifests, rows) else ""
+    headline = HEADLINES[tone].format(source="video" if filmed else "photographs", after=after)
+    return Outcome(tone, headline, text, f"{psnr:.1f}")
+
+
+def short_training(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> tuple[int, int] | None:
+    """Return the steps of the first training and the standard number, if it had less than `SHORT` of them."""
+    steps = figure_of(manifests, "g0", "steps") or 0
+    standard = steps_from_frames(sum(bool(row.weight) for row in rows))
+    return (steps, standard) if "g0" in manifests and steps < SHORT * standard else None
 
 
 def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> str:

@@ -20,6 +20,7 @@ from cleargs.errors import InputError
 from cleargs.files import whole_folder, write_bytes
 from cleargs.formation.frames import camera_of
 from cleargs.manifest import plain_json
+from cleargs.named_views import read_views
 from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.plan import Planner, StagePlan
@@ -37,7 +38,7 @@ from cleargs.report.frames import (
     scores_of,
     worst_cue,
 )
-from cleargs.report.outcome import outcome
+from cleargs.report.outcome import LOOSE_DB, outcome
 from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
 from cleargs.report.report_json import (
     ENTRY,
@@ -116,7 +117,7 @@ def write_report(planner: Planner) -> Path:
             viewer = write_viewer(folder)
         models = scene_with_models(rows, run, manifests)
         pictures = write_pictures(rows, run, folder, final, models, planner.threads)
-        settings, times = viewer_data(placed, scene) if scene else (None, {})
+        settings, times = viewer_data(placed, scene, read_views(run)) if scene else (None, {})
         frames = [
             frame_data(row, pictures[number], times.get(number))
             for number, row in zip(pictures, rows, strict=True)
@@ -130,11 +131,12 @@ def write_report(planner: Planner) -> Path:
             outcome=outcome(manifests, rows, unseen),
             advice=shown_advice(planner, manifests, rows),
             scene=scene,
+            views=settings["views"] if settings else [],
             films=sorted(file.name for file in run.glob("*.mp4")),
             viewer=viewer,
             licence=(folder / LICENCE).read_text(encoding="utf-8") if viewer else "",
             size=single_file_size(folder),
-            stages=planner.dag.names,
+            stages=planner.run.stages(planner.dag),
             manifests=manifests,
             cameras=cameras_of(manifests),
             plans=plans,
@@ -147,6 +149,9 @@ def write_report(planner: Planner) -> Path:
                 "layers": LAYERS,
                 "meanings": MEANINGS,
                 "opening": {"left": "observed", "right": "final"},
+                "poor": LOOSE_DB,
+                "program": f"{program(run.parent)} ",
+                "shellName": quote(run.name),
                 "start": opening_frame(placed).frame.frame_id if scene else None,
                 "frames": frames,
                 "viewer": settings,

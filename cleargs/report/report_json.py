@@ -25,6 +25,9 @@ _OURS = re.compile(
 )
 """Files of a report, relative to its folder."""
 
+_GENERATOR = b'"generator" content="ClearGS '
+"""Mark in the head of the pages."""
+
 
 def page_of(run: Path) -> Path:
     """Return the path of the report of ``run``, which need not exist."""
@@ -45,6 +48,11 @@ def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
     return False
 
 
+def is_own_page(page: Path) -> bool:
+    """Return True if the HTML file ``page`` is a report. Raises OSError if it cannot be read."""
+    return _GENERATOR in read_bytes(page)[:4096]
+
+
 def require_own(run: Path) -> None:
     """Raise StoreError if the report of a run or batch would replace what is not a report of ClearGS.
 
@@ -54,7 +62,7 @@ def require_own(run: Path) -> None:
     refuse_links([folder, entry])
     names = [file.relative_to(folder).as_posix() for file in regular_files(folder)]
     others = [f"{folder}/{name}" for name in names if not _OURS.fullmatch(name) or PAGE not in names]
-    for page, mark in ((folder / PAGE, b'"generator" content="ClearGS '), (entry, b"url=report/index.html")):
+    for page, mark in ((folder / PAGE, _GENERATOR), (entry, b"url=report/index.html")):
         noted = page != entry and REPORT_JSON in names
         if page.exists() and not noted and mark not in read_bytes(page, root=run)[:4096]:
             others.append(str(page))

@@ -10,6 +10,7 @@ import json
 import os
 import socket
 import sys
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
@@ -24,7 +25,7 @@ from urllib.parse import urlsplit
 from cleargs.errors import InputError
 from cleargs.manifest import plain_json
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.live import preview_of, running_stage
+from cleargs.pipeline.live import preview_of, running_stage, stage_at_work
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.report.report_json import FOLDER, PAGE, is_current, linked_manifests, page_of
 from cleargs.safe_io import faults_as, open_own
@@ -142,14 +143,16 @@ class _Handler(SimpleHTTPRequestHandler):
         manifests = linked_manifests(run.folder, self._dag.names)
         preview = None if work is None else preview_of(work, run.store)
         stages = []
-        for name in self._dag.names:
+        stopped = stage_at_work(run.folder, run.store)
+        for name in run.stages(self._dag):
             running = work is not None and work.stage == name
             state = "running" if running else "done" if name in manifests else "to do"
             seconds = manifests[name].seconds if state == "done" else None
             stages.append({"name": name, "state": state, "seconds": seconds})
         return {
             "name": run.folder.name,
-            "now": None if work is None else work.model_dump(),
+            "now": None if work is None else work.model_dump() | {"seconds": time.time() - work.begun},
+            "stopped": None if work or stopped is None else ": ".join(stopped),
             "stages": stages,
             "preview": None if preview is None else str(preview.version),
             "report": page_of(run.folder).is_file(),

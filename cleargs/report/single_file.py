@@ -10,7 +10,9 @@ from pathlib import Path
 from markupsafe import escape
 
 from cleargs.files import write_bytes
+from cleargs.own_files import regular_files
 from cleargs.program import program
+from cleargs.safe_io import read_bytes
 
 _SCRIPTS = ("viewer.js", "scene.js")
 _DATA = '<script type="application/json" id="data">'  # the scripts and images are put in front of it
@@ -28,14 +30,17 @@ def write_single_file(page: Path, target: Path) -> int:
     """Write the report at ``page`` as one HTML file, and return its size in bytes.
 
     Images that the page shows at once are put in place of their links. The others are in the object
-    ``window.files``. Raises StoreError if the file cannot be written.
+    ``window.files``. Links in the report, which another person may have sent, are left out. Raises StoreError
+    if the file cannot be written.
     """
     folder = page.parent
+    files = {file.relative_to(folder).as_posix(): file for file in regular_files(folder)}
     images = {
-        file.relative_to(folder).as_posix(): f"data:image/jpeg;base64,{b64encode(file.read_bytes()).decode()}"
-        for file in sorted(folder.rglob("*.jpg"))
+        name: f"data:image/jpeg;base64,{b64encode(file.read_bytes()).decode()}"
+        for name, file in files.items()
+        if name.endswith(".jpg")
     }
-    html, shown = for_others(page.read_text(encoding="utf-8"), folder.parent), set()
+    html, shown = for_others(read_bytes(page, root=folder).decode(), folder.parent), set()
 
     def with_content(link: re.Match[str]) -> str:
         shown.add(link[1])
@@ -43,7 +48,7 @@ def write_single_file(page: Path, target: Path) -> int:
 
     html = re.sub(r' src="([^"]+)"', with_content, html.replace("<html ", "<html data-single ", 1))
     others = {name: image for name, image in images.items() if name not in shown}
-    scripts = [(folder / name).read_text() for name in _SCRIPTS if (folder / name).is_file()]
+    scripts = [files[name].read_text() for name in _SCRIPTS if name in files]
     scripts.append(f"window.files = {json.dumps(others)};")
     inside = "".join(f"<script>{script}</script>\n" for script in scripts)
     data = html.replace(_DATA, inside + _DATA, 1).encode()

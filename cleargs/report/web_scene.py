@@ -18,6 +18,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from cleargs.formation.frames import camera_of
+from cleargs.named_views import NamedView
 from cleargs.report.frames import FrameRow
 from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply
@@ -98,15 +99,23 @@ def opening_frame(placed: Sequence[FrameRow]) -> FrameRow:
 
 
 def viewer_data(
-    placed: Sequence[FrameRow], scene: Mapping[str, Any]
+    placed: Sequence[FrameRow], scene: Mapping[str, Any], views: Sequence[NamedView] = ()
 ) -> tuple[dict[str, Any], dict[int, float]]:
     """Return the settings of the viewer (schema of SuperSplat Viewer, version 2), and frame_id -> time in s.
 
-    The trajectory is an animation track whose keys are the poses of the ``placed`` frames. ``scene`` is the
-    data of the scene for the page.
+    The trajectory is an animation track whose keys are the poses of the ``placed`` frames, and after them the
+    ``views``. ``scene`` is the data of the scene for the page.
     """
-    poses = {row.frame.frame_id: viewer_pose(camera_of(row.frame)) for row in placed}
-    times = {frame_id: index * _SECONDS_PER_FRAME for index, frame_id in enumerate(poses)}
+    poses: dict[int | str, dict[str, Any]] = {
+        row.frame.frame_id: viewer_pose(camera_of(row.frame)) for row in placed
+    }
+    times = {row.frame.frame_id: index * _SECONDS_PER_FRAME for index, row in enumerate(placed)}
+    fov = next(iter(poses.values()))["fov"]
+    for view in views:
+        ends = {"position": view.position, "target": view.target}
+        poses[view.name] = {name: (np.array(x) * _ROTATION).tolist() for name, x in ends.items()} | {
+            "fov": fov
+        }
     start = opening_frame(placed).frame.frame_id
     track = {
         "name": "trajectory",
@@ -127,6 +136,10 @@ def viewer_data(
     data = {
         "antialias": scene["antialias"],
         "step": _SECONDS_PER_FRAME,
+        "views": [
+            {"name": view.name, "time": (len(placed) + k) * _SECONDS_PER_FRAME}
+            for k, view in enumerate(views)
+        ],
         "rotations": [viewer_rotation(camera_of(row.frame)) for row in placed],
         "settings": {
             **json.loads((_VIEWER / "settings.json").read_text(encoding="utf-8")),

@@ -307,6 +307,19 @@ def test_a_folder_with_other_content_is_no_batch(
     assert mine.read_text() == "years of work" and len(list(toys.folder.iterdir())) == 1
 
 
+def test_exports_of_the_user_next_to_runs_are_not_replaced(
+    toys: ToyBatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert toys.run() == 0
+    (toys.folder / "summary.csv").unlink()
+    mine = toys.folder / "exports" / "barn.ply"
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("years of work")
+    capsys.readouterr()
+    assert toys.run() == 2 and "exports was not made by a batch; it has" in capsys.readouterr().err
+    assert mine.read_text() == "years of work"
+
+
 @pytest.mark.parametrize("name", ["scenes", "logs", "logs/barn.log", "scenes/barn", "exports", "summary.csv"])
 def test_links_in_a_batch_are_refused(toys: ToyBatch, capsys: pytest.CaptureFixture[str], name: str) -> None:
     assert toys.run() == 0

@@ -208,3 +208,35 @@ def previews_at_the_top(root: Path, pictures: Pictures, poses: Poses) -> None:
         save(root / f"shots/{index:04d}.jpg", picture)
     for index in range(2):
         save(root / f"cover_{index}.jpg", cv2.resize(pictures[index], (96, 72)))
+
+
+def metashape(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, and masks that Metashape exported."""
+    for index, picture in enumerate(pictures):
+        save(root / f"photos/{index:04d}.jpg", picture)
+        save(root / f"mask/{index:04d}_mask.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+
+
+def scannetpp(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """ScanNet++, the part of the iPhone, with its masks of faces."""
+    for index, picture in enumerate(pictures):
+        save(root / f"iphone/rgb/frame_{index:06d}.jpg", picture)
+        save(root / f"iphone/rgb_masks/frame_{index:06d}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+        depth(root / f"iphone/depth/frame_{index:06d}.png")
+
+
+def monocular_maps(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs next to normals and labels in colour, as networks write them."""
+    for index, picture in enumerate(pictures):
+        save(root / f"rgb/{index:04d}.jpg", picture)
+        save(root / f"normal/{index:04d}.png", picture[::-1])
+        save(root / f"semantic/{index:04d}.jpg", picture[:, ::-1])
+
+
+def edited_and_downloaded_twice(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """iPhone photographs with edited versions, those of Google Photos, and a second download."""
+    for index, picture in enumerate(pictures):
+        save(root / f"IMG_{index:04d}.JPG", picture)
+    save(root / "IMG_E0001.JPG", pictures[1][::-1])
+    save(root / "IMG_0002-edited.JPG", pictures[2][::-1])
+    save(root / "IMG_0003 (1).JPG", pictures[3])

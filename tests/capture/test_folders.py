@@ -20,7 +20,8 @@ from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
 
 from . import apps
-from .conftest import FOCAL, Ingest
+from .conftest import FOCAL, HEIGHT, WIDTH, Ingest
+from .test_data_sets import poses_bounds
 
 Frames = Sequence[tuple[NDArray[np.float64], NDArray[np.uint8]]]
 
@@ -44,6 +45,10 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "rig": (apps.two_cameras, 10, "10 photographs (images/cam0/ 5, images/cam1/ 5)"),
     "copies": (apps.reduced_copies, 10, "in another format (tiff/ 10, web/ 10, thumbs/ 10)"),
     "masks": (apps.masks_beside, 10, "10 masks"),
+    "Metashape": (apps.metashape, 10, "10 photographs (photos/) and 10 masks (mask/)"),
+    "ScanNet++": (apps.scannetpp, 10, "and 10 masks (iphone/rgb_masks/); left out: 10 depth maps"),
+    "maps": (apps.monocular_maps, 10, "10 photographs (rgb/); left out: 20 second pictures"),
+    "edited": (apps.edited_and_downloaded_twice, 10, "left out: 3 second pictures"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
@@ -183,6 +188,19 @@ def test_a_run_in_the_folder_is_no_photograph(images: Path, frames: Frames) -> N
     assert len(open_capture(images, IngestConfig()).frames) == 10
 
 
+@pytest.mark.parametrize(
+    "links",
+    [{"a": "."}, {"a": ".", "b": "."}, {"in/a": "..", "in/b": ".."}, {"masks/a": ".", "masks/b": ".."}],
+)
+def test_each_folder_is_entered_once(images: Path, links: dict[str, str]) -> None:
+    for name, target in links.items():
+        (images / name).parent.mkdir(exist_ok=True)
+        (images / name).symlink_to(target)
+    capture = open_capture(images, IngestConfig())
+    assert (capture.n_available, capture.told) == (10, "read: 10 photographs")
+    externals(images, IngestConfig())
+
+
 @pytest.mark.parametrize("name", [".thumbnails", "@eaDir", "__MACOSX", "#recycle"])
 def test_folders_of_systems_are_not_read(images: Path, name: str) -> None:
     shutil.copytree(images, images.parent / "copy")
@@ -242,6 +260,17 @@ def test_other_files_and_folders_stand_for_themselves(tmp_path: Path, images: Pa
     assert whole_capture(tmp_path / "nothing") == tmp_path / "nothing"
 
 
+def test_a_capture_whose_name_is_a_number(tmp_path: Path, images: Path) -> None:
+    """COLMAP's automatic reconstructor writes the undistorted images and their model into dense/0."""
+    whole = tmp_path / "dense" / "0"
+    shutil.copytree(images, whole / "images")
+    (whole / "sparse").mkdir()
+    (whole / "sparse/cameras.bin").touch()
+    assert whole_capture(whole / "sparse") == whole_capture(whole / "sparse/cameras.bin") == whole
+    shutil.copytree(images, tmp_path / "images")
+    assert any(f"give {whole} as" in note for note in open_capture(tmp_path, IngestConfig()).notes)
+
+
 def test_videos_next_to_few_photographs_are_the_capture(tmp_path: Path, frames: Frames) -> None:
     write(apps.stray, tmp_path / "a", frames)
     (tmp_path / "a/rgb.mp4").rename(tmp_path / "walk.mp4")
@@ -267,6 +296,32 @@ def test_masks_at_other_places(tmp_path: Path, frames: Frames, place: str) -> No
     stencils = [read_stencil(frame) for frame in capture.frames]
     assert len(stencils) == 10 and "and 10 masks" in capture.told
     assert [None if s is None else bool(s.all()) for s in stencils] == [False] + [True] * 9
+
+
+def test_masks_that_fit_no_photograph_are_named(tmp_path: Path, frames: Frames) -> None:
+    root = write(apps.iphone, tmp_path / "capture", frames)
+    for index in range(3):
+        apps.save(root / f"masks/person{index}/all.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    capture = open_capture(root, IngestConfig())
+    assert "left out: 3 masks without a photograph of the same name" in capture.told
+    assert any("name masks like their photographs" in note for note in capture.notes)
+
+
+@pytest.mark.parametrize("only", [None, "images/00000[0-4].png"])
+def test_listed_pictures_are_told(
+    posed: Path, frames: Frames, ingest: Ingest, tmp_path: Path, only: str | None
+) -> None:
+    made, root, config = ingest(posed, "made"), tmp_path / "project", IngestConfig(only=only)
+    shutil.copytree(made.out / "images", root / "images")
+    shutil.copytree(made.out / "colmap/sparse", root / "sparse")
+    apps.save(root / "images_2/000000.png", np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
+    count = 10 if only is None else 5
+    read = f"read: {count} pictures, {count} with a pose in"
+    told = open_capture(root, config).told
+    assert told.startswith(f"{read} the COLMAP model of sparse/0/; left") and "images_2/ 1" in told
+    shutil.rmtree(root / "sparse")
+    np.save(root / "poses_bounds.npy", poses_bounds([pose for pose, _ in frames]))
+    assert open_capture(root, config).told.startswith(f"{read} poses_bounds.npy; left")
 
 
 def test_raw_photographs_are_told(images: Path) -> None:

@@ -114,7 +114,7 @@ def test_run_lists_the_stages_that_run_again(shell: Shell) -> None:
 
 def test_the_cost_is_revised_when_the_capture_is_known(shell: Shell) -> None:
     _, _, err = shell.run("--set", "count.limit=3")
-    first, revised = (line for line in err.splitlines() if "estimate: about" in line)
+    first, revised, *_ = (line for line in err.splitlines() if "estimate: about" in line)
     assert first == (
         "estimate: about 6.4 min, 0.1 GB memory, 3 MB disk (count 6 s, square 6.0 min, total 18 s)"
     )
@@ -460,7 +460,7 @@ def test_the_time_left_counts_from_the_first_step_on(
             clock[0] = now
             task.update(done=done)
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["G0: 1/1000", "G0: 101/1000, 180 s left", "G0: done in 120.0 s"]
+    assert lines == ["G0: 1/1000, for 100 s", "G0: 101/1000, 180 s left", "G0: done in 120.0 s"]
 
 
 def test_the_time_left_follows_the_work_where_steps_differ(

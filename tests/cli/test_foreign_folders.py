@@ -220,6 +220,31 @@ def test_partial_folders_of_killed_processes_are_found(
         assert not dead.exists() and alive.is_dir() and (bench.folder / ".mine.partial.report/a").is_file()
 
 
+def test_gc_removes_partial_files_of_killed_processes(
+    give: Callable[..., tuple[int, str]], bench: Bench
+) -> None:
+    give("run", "-o", bench.folder)
+    places = (bench.folder, bench.store, bench.store / "roots")
+    dead = [write(place / ".0123abcd.partial.run.toml") for place in places]
+    written = write(bench.folder / ".0123abce.partial.film.mp4")
+    mine = write(bench.folder / ".mine.partial.run.toml")
+    for file in (*dead, mine):
+        os.utime(file, (0, 0))
+    assert give("gc", bench.folder, "--yes")[0] == 0
+    assert not any(file.exists() for file in dead) and written.is_file() and mine.is_file()
+
+
+def test_links_in_the_cache_of_a_stage_are_removed_before_it_runs(bench: Bench, tmp_path: Path) -> None:
+    mine = write(tmp_path / "mine" / f"{1:064x}.json")
+    kept = bench.store / "kept" / "square"
+    cached = write(kept / f"{2:064x}.json", "{}")
+    (kept / mine.name).symlink_to(mine)
+    (bench.store / "kept" / "total").symlink_to(mine.parent)
+    bench.run()
+    assert not os.path.lexists(kept / mine.name) and not os.path.lexists(bench.store / "kept" / "total")
+    assert cached.read_text() == "{}" and mine.read_text() == "years of work"
+
+
 def test_loops_of_links_in_a_capture_end(tmp_path: Path) -> None:
     write(tmp_path / "sub" / "a.png")
     for name in ("x", "y", "sub/up1", "sub/up2"):

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from cleargs.cli.frame_rows import frame_rows, reason, short_name
+from cleargs.cli.frame_rows import frame_rows, reason, score_text, short_name
 from cleargs.cli.show import labelled
 from cleargs.report.frames import worst_cue
 from cleargs.rva.tables import B_CUES, R_CUES
@@ -98,3 +98,14 @@ def test_figures_have_labels() -> None:
         ("weights", "5 from 0.1, 7 from 0.9"),
         ("some new figure", "3"),
     ]
+
+
+def test_scores_have_the_digits_that_decide() -> None:
+    """Once, R 0.695 was printed as 0.70, next to the reason R < 0.7."""
+    assert [score_text("R", value, SETTINGS) for value in (0.695374, 0.69999, 0.7, 0.62)] == [
+        "0.695",
+        "0.69999",
+        "0.700000",
+        "0.62",
+    ]
+    assert score_text("B", 0.6004, SETTINGS) == "0.6004" and score_text("G", 0.25, {}) == "0.25"

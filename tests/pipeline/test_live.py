@@ -13,8 +13,15 @@ from toy import Bench
 from cleargs.cli.main import invoke
 from cleargs.errors import StoreError
 from cleargs.pipeline import live
-from cleargs.pipeline.live import PROGRESS_FILE, RunningStage, preview_of, recorded_progress, running_stage
-from cleargs.progress import COMPILING, SilentReporter
+from cleargs.pipeline.live import (
+    PROGRESS_FILE,
+    RunningStage,
+    preview_of,
+    recorded_progress,
+    running_stage,
+    stage_at_work,
+)
+from cleargs.progress import COMPILING, LineReporter, SilentReporter
 
 
 def test_an_active_run_is_visible_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
@@ -42,7 +49,7 @@ def test_an_active_run_is_visible_until_it_ends(bench: Bench, capsys: pytest.Cap
     assert running_stage(bench.folder, bench.store) is None and not (bench.folder / PROGRESS_FILE).exists()
 
 
-def test_a_killed_run_is_not_active(bench: Bench) -> None:
+def test_a_killed_run_is_not_active(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     hold = bench.root / "hold"
     hold.touch()
     process = start(bench, f"square.hold={hold}")
@@ -50,6 +57,12 @@ def test_a_killed_run_is_not_active(bench: Bench) -> None:
     process.kill()
     process.wait()
     assert (bench.folder / PROGRESS_FILE).exists() and running_stage(bench.folder, bench.store) is None
+    assert stage_at_work(bench.folder, bench.store) == (
+        "square",
+        "stopped at square; continues from its last checkpoint",
+    )
+    assert invoke(["status", str(bench.folder)], bench.dag) == 0
+    assert "stopped at square; continues from its last checkpoint" in capsys.readouterr().out
     hold.unlink()
     assert [outcome.how for outcome in bench.run()] == ["found", "made", "made"]
     assert not (bench.folder / PROGRESS_FILE).exists()
@@ -132,3 +145,20 @@ def test_the_progress_file_is_not_in_the_work_folder(bench: Bench) -> None:
     assert PROGRESS_FILE not in files and "state.txt" in files
     hold.unlink()
     assert process.wait(60) == 0
+
+
+def test_an_interrupted_task_stays_visible(tmp_path: Path) -> None:
+    work = tmp_path / "store" / "work" / "key"
+    (work / "checkpoints").mkdir(parents=True)
+    (work / "checkpoints" / "g0.safetensors").touch()
+    lines: list[str] = []
+    reporter = LineReporter(lines.append, lines.append, lambda line: None)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        recorded_progress(reporter, tmp_path, "g0", work) as recorder,
+        recorder.task("G0", 800) as task,
+    ):
+        task.update(done=130, note="24.1 dB")
+        raise KeyboardInterrupt
+    assert lines == ["g0: stopped at G0, 130 of 800, 24.1 dB; continues from its last checkpoint"]
+    assert stage_at_work(tmp_path, tmp_path / "store") == tuple(lines[0].split(": ", 1))

@@ -24,6 +24,7 @@ from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.report.advice import Advice, shown_advice
 from cleargs.report.frames import FrameRow, load_rows
+from cleargs.report.outcome import outcome
 from cleargs.report.report_json import linked_manifests
 
 SIZE = 64
@@ -95,6 +96,7 @@ def test_printed_commands_run_as_printed(
 ) -> None:
     # On a machine that is known to be fast, both commands are expected to take a minute.
     monkeypatch.setattr("cleargs.splat.pace.cached_pace", lambda: None)
+    monkeypatch.setattr(Planner, "pace_of", lambda self, made: 1.0)  # the fixture took no time
     finished = FinishedRun(tmp_path)
     (tmp_path / "my capture").mkdir()
     for k in range(4):
@@ -119,3 +121,22 @@ def test_printed_commands_run_as_printed(
         assert program == "cleargs" and invoke([*words, "--dry-run"], finished.dag) == 0, (
             capsys.readouterr().err
         )
+
+
+def test_the_verdict_names_the_capture_and_a_short_training() -> None:
+    def headline(steps: int, time_s: float | None) -> str:
+        facts = {"registered": True, "split": "train", "time_s": time_s}
+        rows = [FrameRow(SimpleNamespace(**facts), {"role": "strong", "weight": 1.0})] * 40  # type: ignore[arg-type]
+        g0 = SimpleNamespace(summary={"psnr_unseen": 32.4, "steps": steps})
+        return outcome({"g0": g0}, rows, []).headline  # type: ignore[dict-item]
+
+    assert headline(40, None) == "Good: the scene matches the photographs closely after a short training."
+    assert headline(10_000, 0.1) == "Good: the scene matches the video closely."
+
+
+def test_a_draft_has_no_stages_for_repairs(tmp_path: Path) -> None:
+    def stages(*settings: str) -> tuple[str, ...]:
+        config = load_config(installed(), "default", settings)
+        return RunSpec(tmp_path, tmp_path, config, tmp_path, "cpu").stages(installed())
+
+    assert stages("g0.quality=draft") == ("ingest", "rva", "g0") and len(stages()) == 5

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
+import shlex
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +19,11 @@ from report_run import COUNT, HOSTILE, FinishedRun
 from cleargs.capture.tables import load_frames
 from cleargs.digest import DigestMemo
 from cleargs.formation.frames import camera_of
+from cleargs.named_views import keep_views
 from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
 from cleargs.report.single_file import write_single_file
-from cleargs.splat.render import Viewer
+from cleargs.splat.render import Viewer, render
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
@@ -142,7 +147,67 @@ def test_arrows_and_the_timeline_move_the_camera(wide: Report, run: FinishedRun)
     stands_at(2)
     page.keyboard.press("End")
     assert "its camera is not known" in page.locator("#readout").inner_text()
-    assert page.locator("#lanes rect.worst").count() == 5
+    psnr = page.evaluate(
+        "report.frames.filter((frame) => frame.role !== 'held out').map((frame) => frame.psnr)"
+    )
+    poor = [value for value in psnr if value is not None and value < 22]
+    assert page.locator("#lanes rect.worst").count() == len(poor)
+
+
+def test_two_clicks_measure_and_give_the_scale(wide: Report, run: FinishedRun) -> None:
+    page, camera = wide.page, camera_of(load_frames(run.folder / "ingest")[3])
+    page.evaluate("window.timeline.select(3)")
+    wide.settle()
+    page.locator('[data-act="measure"]').click()
+    box = page.locator(".live").bounding_box()
+    places = [(0.4, 0.5), (0.6, 0.55)]
+    for x, y in places:
+        page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        page.wait_for_timeout(300)
+    page.wait_for_function("window.reportMeasure.points.length === 2")
+    points = np.array(page.evaluate("window.reportMeasure.points"))
+    seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    clicked = np.array(places) * [camera.width, camera.height]
+    assert np.abs(pixels - clicked).max() < 0.02 * camera.width  # a pixel of the small window
+    found = render(run.scenes["consolidate"].gaussians, camera)
+    depth = (found.depth / found.alpha).detach().numpy()[clicked[:, 1].astype(int), clicked[:, 0].astype(int)]
+    assert np.abs(seen[:, 2] / depth - 1).max() < 0.1  # a half of the light here, a mean there
+    page.locator("#metres").fill("2.5")
+    page.locator("#metres").press("Enter")
+    commands = page.locator("#measure code").all_inner_texts()
+    pair = re.search(r"--metres (\d+)-(\d+)=([\d.]+)$", commands[0])
+    ends = [camera_of(load_frames(run.folder / "ingest")[int(pair[n])]).centre for n in (1, 2)]
+    factor = float(pair[3]) / np.linalg.norm(ends[0] - ends[1])
+    assert factor * np.linalg.norm(points[0] - points[1]) == pytest.approx(2.5, rel=1e-4)
+    corners = [float(x) for x in re.search(r"--crop box:(\S+)$", commands[1])[1].split(",")]
+    assert np.allclose(corners, [*points.min(0), *points.max(0)], rtol=1e-3)
+    if folder := os.environ.get("CLEARGS_SHOTS"):
+        page.screenshot(path=f"{folder}/measure.png")
+    page.locator('[data-act="measure"]').click()
+
+
+def test_a_kept_view_comes_back_in_the_single_file(wide: Report, browser: Any, tmp_path: Path) -> None:
+    wide.page.locator('[data-act="keep"]').click()
+    said = wide.page.locator("#measure code").inner_text()
+    name, _, numbers = shlex.split(said)[-1].partition("=")
+    there = wide.camera()
+    values = np.array([float(x) for x in numbers.split(",")])
+    assert name == "start" and np.allclose(values[:3], there[:3] * [-1, -1, 1], atol=1e-4)
+    other = FinishedRun(tmp_path / "other")
+    moved = values + np.array([0.1, 0, 0.1] * 2)
+    keep_views(other.folder, ["start=" + ",".join(map(str, moved)), "Desk=0,0,-1,0,0,1"])
+    (other.folder / ".store").mkdir()
+    with DigestMemo(other.folder / ".store/digests.json") as memo:
+        page = write_report(other.planner(Store(other.folder / ".store", memo)))
+    write_single_file(page, tmp_path / "alone.html")
+    with closing(browser.new_page(viewport={"width": 640, "height": 500}, device_scale_factor=0.5)) as tab:
+        opened = Report(tab, (tmp_path / "alone.html").as_uri())
+        opened.scene()
+        assert np.allclose(opened.camera()[:3], moved[:3] * [-1, -1, 1], atol=1e-3)
+        tab.get_by_role("button", name="Desk").click()
+        opened.settle()
+        assert np.allclose(opened.camera(), [0, 0, -1, 0, 0, 1], atol=1e-3)
 
 
 def test_a_scene_with_roll_is_shown_as_filmed(wide: Report) -> None:

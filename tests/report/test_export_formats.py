@@ -15,9 +15,14 @@ from colmap_model import POINTS_XYZ, write_no_formation, write_sparse
 from report_run import FinishedRun
 
 from cleargs.capture.model import read_model
+from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
+from cleargs.errors import InputError
 from cleargs.formation.observed import Fit
+from cleargs.named_views import keep_views
 from cleargs.render import pruning
+from cleargs.report.frames import camera_of
+from cleargs.splat.camera import Camera
 from cleargs.splat.formats import FORMATS
 from cleargs.splat.ply import read_ply
 
@@ -180,6 +185,23 @@ def test_a_frame_without_a_pixel_that_counts_is_not_in_the_psnr_of_pruning(
     assert numbers(capsys, PRUNED)[1:] == [30.0, 20.0]
 
 
+def test_a_sphere_is_dropped_and_the_box_of_the_scene_shown(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    means = read_ply(run.folder / "consolidate/scene.ply").gaussians.means
+    centre = ",".join(f"{x:.6f}" for x in means[7].tolist())
+    assert export(run, tmp_path / "d.ply", "--drop", f"sphere:{centre},0.01") == 0
+    (gone,) = numbers(capsys, r"dropped (\d+) Gaussians")
+    left = read_ply(tmp_path / "d.ply").gaussians.means
+    assert len(left) == len(means) - int(gone) and (left - means[7]).norm(dim=1).min() > 0.01
+    assert invoke(["show", str(run.folder), "scene", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["low"] == means.amin(0).tolist() and facts["high"] == means.amax(0).tolist()
+    assert export(run, tmp_path / "e.ply", "--crop", "box:50,50,50,51,51,51") == 2
+    box = ",".join(f"{x:.4g}" for x in facts["low"] + facts["high"])
+    assert f"the scene is in box:{box}, its 1 to 99 % in box:" in capsys.readouterr().err
+
+
 def test_a_crop_uses_the_coordinates_of_the_cameras(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,6 +242,8 @@ def test_up(run: FinishedRun, kind: str, tmp_path: Path) -> None:
         ("a.ply", ("--crop", "box:1,1,1,0,0,0"), "--crop box"),
         ("a.ply", ("--crop", "percentile:101"), "--crop percentile"),
         ("a.ply", ("--crop", "box:50,50,50,51,51,51"), "no Gaussian is left"),
+        ("a.ply", ("--drop", "sphere:0,0,0"), "--drop sphere"),
+        ("a.ply", ("--drop", "sphere:50,50,50,1"), "no Gaussian is in the sphere"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(
@@ -233,3 +257,28 @@ def test_what_cannot_be_meant_is_refused(
     assert export(run, tmp_path / name, *options) == 2 and not list(tmp_path.iterdir())
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("error", "hint"))]
     assert len(said) == 2 and cause in said[0]
+
+
+def test_named_views_go_to_web_pages(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(run, tmp_path / "none.spz", "--for", "web") == 0
+    assert not (tmp_path / "none.views.json").exists()
+    keep_views(run.folder, ["start=0,0,-1,0,0,1", "gone=0,0,0,1,1,1", "gone="])
+    try:
+        assert export(run, tmp_path / "a.spz", "--for", "web", "--cameras") == 0
+    finally:
+        (run.folder / "views.json").unlink()
+    (view,) = json.loads((tmp_path / "a.views.json").read_text())
+    first = json.loads((tmp_path / "a.cameras.json").read_text())[0]
+    turn = np.array(first["rotation"]) @ camera_of_first(run).world_to_camera[:3, :3]
+    assert view["name"] == "start"
+    assert np.allclose(np.subtract(view["target"], view["position"]), turn @ [0, 0, 2], atol=1e-6)
+    assert np.allclose(view["up"], turn @ [0, -1, 0], atol=1e-6)
+    for wrong in ("x", "x=1,2,3", "=0,0,0,1,1,1", "x=0,0,0,0,0,0"):
+        with pytest.raises(InputError, match="--view"):
+            keep_views(run.folder, [wrong])
+
+
+def camera_of_first(run: FinishedRun) -> Camera:
+    return camera_of(next(frame for frame in load_frames(run.folder / "ingest") if frame.registered))

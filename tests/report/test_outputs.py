@@ -180,6 +180,35 @@ def test_eval_keeps_references_and_foreign_results(
     assert (tmp_path / "table.parquet").read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    ("words", "name", "told"),
+    [
+        (["show", "RUN", "--frame", "3", "-o", "mine/a.png"], "a.png", "exists already"),
+        (["report", "RUN", "--single-file", "-o", "mine/a.html"], "a.html", "is not a report"),
+        (["eval", "RUN", "--reference", "x", "--save-renders", "mine"], "000000.png", "mine is not empty"),
+    ],
+)
+def test_other_files_are_not_replaced(
+    run: FinishedRun,
+    words: list[str],
+    name: str,
+    told: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(run.folder.parent)
+    Path("mine").mkdir()
+    Path("mine", name).write_text("years of work")
+    words = [str(run.folder) if word == "RUN" else word for word in words]
+    assert invoke(words) == 2 and told in capsys.readouterr().err
+    assert Path("mine", name).read_text() == "years of work"
+    if words[0] == "show":
+        assert invoke([*words, "--force"]) == 0
+    if words[0] == "report":
+        Path("mine", name).unlink()
+        assert invoke(words) == invoke(words) == 0, "a report replaces a report"
+
+
 def test_links_that_lead_nowhere_or_in_circles(run: FinishedRun, tmp_path: Path) -> None:
     (tmp_path / "circle.ply").symlink_to(tmp_path / "circle.ply")
     (tmp_path / "gone.ply").symlink_to(tmp_path / "absent" / "a.ply")

@@ -40,9 +40,12 @@ def test_a_frame_in_words_fits_100_columns(
     lines = [line for line in text.splitlines() if not line.startswith("written")]
     assert max(map(len, lines)) <= 100
     words = " ".join(text.split())
-    assert "frame 2 file clip.mp4#2" in words and "time 0.07 s" in words
+    assert (
+        words.startswith("frame 2 counts motion blur 3.2 px, simulated: counts 75 % file clip.mp4#2")
+        and "time 0.07 s" in words
+    )
     assert "pose camera at (-0.200, 0.060, " in words
-    assert "role geometric, weight 0.40: B > 0.6, adds views" not in words  # R 0.8 and B 0.1 pass
+    assert "role by RVA geometric, weight 0.40: B > 0.6, adds views" not in words  # R 0.8 and B 0.1 pass
     assert "R 0.80, B 0.10, G 0.30" in words and "worst cue motion blur 0.70" in words
     assert "motion blur, explains 62 % of the misfit" in words
     assert "blur 3.25 px, rolling shutter 0.00 px" in words

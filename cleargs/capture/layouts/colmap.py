@@ -19,6 +19,7 @@ from cleargs.capture.folders import (
     image_files,
     is_inside,
     is_wanted,
+    listed_pictures,
     mask_externals,
     require_most,
 )
@@ -100,7 +101,10 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
             "and laser scanners export it: points are triangulated from the images"
         )
     sparse = model if seen or model.dropped else None
-    return Capture("colmap", taken, len(frames), sparse, available=tuple(frames), notes=tuple(notes))
+    told = listed_pictures(frames, source, f"the COLMAP model of {folder.relative_to(source)}/")
+    return Capture(
+        "colmap", taken, len(frames), sparse, available=tuple(frames), told=told, notes=tuple(notes)
+    )
 
 
 def _models(root: Path) -> dict[Path, int]:

@@ -32,9 +32,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
             f"{source} holds no images, no video and no transforms.json",
             hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
         )
-    nested = (
-        [path for name in _LISTS for path in sorted(source.glob(f"*/{name}"))] if config.uses_poses else []
-    )
+    patterns = [*(f"*/{name}" for name in _LISTS), "dense/*/sparse"] if config.uses_poses else []
+    nested = [path for pattern in patterns for path in sorted(source.glob(pattern))]
     notes = [f"poses in {path} are not read: give {path.parent} as the input" for path in nested[:1]]
     return Capture(
         "images",

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import chosen, image_files, image_folders, is_wanted, mask_externals
+from cleargs.capture.folders import (
+    chosen,
+    image_files,
+    image_folders,
+    is_wanted,
+    listed_pictures,
+    mask_externals,
+)
 from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, faults_as, open_regular
 
@@ -40,7 +47,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     Frames have the order of the rows, because users of these data sets hold out every N-th row.
     """
     frames = [frame for frame in read_llff(source) if is_wanted(frame.path, source, config)]
-    return Capture("llff", chosen(frames, source, config.max_frames), len(frames))
+    told = listed_pictures(frames, source, POSES_BOUNDS)
+    return Capture("llff", chosen(frames, source, config.max_frames), len(frames), told=told)
 
 
 def read_llff(root: Path) -> list[SourceFrame]:

@@ -73,11 +73,12 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     split = _split_files(source)
     if files == split[:2] and len(split) > 2:
         notes.append(f"{split[2].name} is not read: the test views are those of {split[1].name}")
-    others = {path for folder in {frame.path.parent for frame in frames} for path in image_files(folder)}
+    folders = {frame.path.parent for frame in frames}
+    frames = [frame for frame in frames if is_wanted(frame.path, source, config)]
+    others = {path for folder in folders for path in image_files(folder)}
     others -= {path for frame in frames for path in (frame.path, frame.mask)}
     told = f"read: {len(frames)} pictures that {' and '.join(file.name for file in files)} lists"
     told += f"; left out: {len(others)} others next to them" if others else ""
-    frames = [frame for frame in frames if is_wanted(frame.path, source, config)]
     frames.sort(key=lambda frame: frame_key(frame.name))
     names = [name_below_images(frame.name) for frame in frames]
     taken = chosen(frames, source, config.max_frames, names)

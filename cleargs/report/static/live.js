@@ -19,11 +19,11 @@
     return item;
   };
 
-  const figures = ({ done, total, note, seconds_left: left }) => [
-    total ? `${done} of ${total}` : done || "", note, left === null ? "" : `${duration(left)} left`,
+  const figures = ({ done, total, note, seconds, seconds_left: left }) => [
+    total ? `${done} of ${total}` : done || "", note, left === null ? `for ${duration(seconds)}` : `${duration(left)} left`,
   ].filter(Boolean).join(" · ");
 
-  const show = ({ name, now, stages, preview, report }) => {
+  const show = ({ name, now, stopped, stages, preview, report }) => {
     document.title = `${now ? now.stage : "idle"} · ${name} · ClearGS`;
     one("name").textContent = name;
     one("label").textContent = now ? now.label : "No stage is running";
@@ -32,6 +32,7 @@
     else one("progress").removeAttribute("value");
     one("figures").textContent = now
       ? figures(now)
+      : stopped ? `${stopped}. Continue with cleargs run.`
       : "Continue with cleargs run, or write a report of these results with cleargs report.";
     one("preview").hidden = preview === null;
     if (preview !== null && one("picture").dataset.version !== preview) {

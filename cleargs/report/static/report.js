@@ -114,8 +114,8 @@ const describe = (frame) => {
   const frames = report.frames;
   const lanes = one("#lanes");
   const scrub = one("#scrub");
-  const worst = new Set(frames.filter((frame) => frame.psnr !== null).sort((a, b) => a.psnr - b.psnr).slice(0, 5));
-  const kind = (frame, lane) => (frame.role === "held out" ? "held" : lane.worst && worst.has(frame) ? "worst" : "");
+  const isPoor = (frame) => frame.psnr !== null && frame.psnr < report.poor;
+  const kind = (frame, lane) => (frame.role === "held out" ? "held" : lane.worst && isPoor(frame) ? "worst" : "");
 
   // The lane is left out where no frame has the figure, or where all are below `only`.
   const draw = (lane) => {
@@ -128,7 +128,7 @@ const describe = (frame) => {
     const digits = lane.high ? 2 : 1;
     const label = make("p", undefined, "lane-name");
     const range = `${least.toFixed(digits)} to ${most.toFixed(digits)}${lane.unit}`;
-    const marks = [lane.worst && "red: the five lowest", frames.some((frame) => kind(frame, lane) === "held") && "blue: held out"];
+    const marks = [frames.some((frame) => kind(frame, lane) === "worst") && `red: below ${report.poor} dB`, frames.some((frame) => kind(frame, lane) === "held") && "blue: held out"];
     label.append(make("b", lane.title), make("span", [range, ...(lane.worst ? marks.filter(Boolean) : [])].join(" · ")));
     const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
     for (const [name, value] of [
@@ -155,7 +155,8 @@ const describe = (frame) => {
     scrub.value = frames.indexOf(frame);
     lanes.style.setProperty("--at", scrub.value);
     scrub.setAttribute("aria-valuetext", `frame ${frame.id}`);
-    const facts = [frame.role || "not rated", frame.weight_text, decibels(frame)];
+    const role = frame.weight_text.includes(frame.role) ? "" : `role by RVA: ${frame.role}`;
+    const facts = [frame.weight_text || "not rated", decibels(frame), role];
     if (frame.time === null) facts.push("its camera is not known");
     one("#readout").replaceChildren(make("b", `Frame ${frame.id}`), make("span", facts.filter(Boolean).join(" · ")));
     const filmed = one("#filmed");

@@ -5,8 +5,9 @@
   const stage = one("#stage");
   const status = one("#status");
   const pane = one('[data-pane="scene"]');
-  const { settings, antialias, step, rotations } = report.viewer;
+  const { settings, antialias, step, rotations, views } = report.viewer;
   let viewer = null;
+  let sceneUrl = "";
   let wanted = report.frames[timeline.index()].time ?? 0;
 
   const loadScript = (name) => new Promise((resolve, reject) => {
@@ -27,7 +28,7 @@
 
   const open = async () => {
     const module = await import(await unpack("viewer", "text/javascript"));
-    const url = await unpack("scene", "application/octet-stream");
+    const url = sceneUrl = await unpack("scene", "application/octet-stream");
     const save = one("#save");
     save.hidden = false;
     save.addEventListener("click", () => Object.assign(make("a"), { href: url, download: save.dataset.name }).click());
@@ -63,7 +64,9 @@
     try {
       viewer = await open();
       tilt();
-      goTo(wanted);
+      const start = views.find(({ name }) => name === "start");
+      if (start) showView(start.time);
+      else goTo(wanted);
       viewer.app.once("frameend", () => pane.classList.add("ready"));
       status.textContent = "";
     } catch (error) {
@@ -117,6 +120,12 @@
 
   const goTo = (time) => { stop(); seek(time); };
 
+  // A view of the user is a key of the track behind those of the frames.
+  const showView = (time) => { goTo(time); stage.dataset.away = ""; };
+  for (const button of all("[data-view]")) {
+    button.addEventListener("click", () => { if (viewer) showView(Number(button.dataset.view)); });
+  }
+
   const placed = report.frames.filter((frame) => frame.time !== null);
   const fly = () => {
     const end = step * (placed.length - 1);
@@ -139,12 +148,12 @@
     full: () => (document.fullscreenElement ? document.exitFullscreen() : stage.requestFullscreen()),
   };
   for (const button of all("#controls [data-act]")) {
-    button.addEventListener("click", () => { if (viewer) act[button.dataset.act](); });
+    button.addEventListener("click", () => { if (viewer) act[button.dataset.act]?.(); });
   }
   one("#stand").addEventListener("click", () => {
     inspector.close();
     timeline.select(current);
     stage.scrollIntoView({ block: "center" });
   });
-  window.reportStage = { goTo, get viewer() { return viewer; } };
+  window.reportStage = { goTo, get viewer() { return viewer; }, get sceneUrl() { return sceneUrl; } };
 }
