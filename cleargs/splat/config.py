@@ -113,7 +113,7 @@ class TrainConfig(FrozenModel):
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")
     texture: float = Field(
-        0.0,
+        0.1,
         ge=0,
         description="weight of the term of the loss that compares texture, in the last 30 % of the schedule; "
         "0 = off",
