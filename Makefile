@@ -3,7 +3,7 @@
 # make test              run all tests that are not slow
 # make test-all          run all tests
 # make test-package      build wheel and sdist, install them separately, and run the smoke demo from the wheel
-# make drill             kill every stage and gc 50 times and compare the results
+# make drill             kill every stage and gc 50 times, plant 1,000 links in runs, and compare
 # make fuzz              read 2,000 mutations of each kind of file; SEED=N selects others
 # make findings          run the scripts of findings/, which need the network: what other libraries and formats really do
 # make lint              ruff, codespell, mypy and the check of the prose (tools/prose.py)
@@ -72,6 +72,7 @@ docs: .venv/docs.stamp
 
 drill: .venv/test.stamp
 	$(BIN)/python tests/drill.py
+	$(BIN)/python tests/planted_links.py --links 1000
 
 fuzz: .venv/test.stamp
 	CLEARGS_FUZZ=2000 $(BIN)/python -m pytest tests/test_fuzz.py --hypothesis-seed=$(or $(SEED),0)

@@ -56,7 +56,7 @@ class G0Config(TrainConfig):
     exposure: Literal["auto", "on", "off"] = Field(
         "auto",
         description="one colour affine per frame; auto = on if the brightness of the frames, measured at "
-        "the sparse points, spreads by more than 5 %",
+        "the sparse points, spreads by more than 5 %, or a colour channel without it by more than 2.5 %",
     )
     antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
     min_points: int = Field(
@@ -68,6 +68,8 @@ class G0Config(TrainConfig):
 
     exposure_threshold: ClassVar[float] = 0.05
     """``auto`` is on if the `gain_spread` of the frames is above this. With a fixed exposure it is below."""
+    colour_threshold: ClassVar[float] = 0.025
+    """The same for the channels without the brightness. Captures with one white balance had .001 to .024."""
 
 
 class DistilConfig(FrozenModel):

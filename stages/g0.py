@@ -18,7 +18,7 @@ def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
     return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
 
 
-VERSION = 45
+VERSION = 47
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -60,14 +60,14 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
 
 def run(context: StageContext[G0Config]) -> StageResult:
     """Make Gaussians from the sparse points and train them on the active frames with their RVA weights."""
-    from cleargs.capture.folders import spread
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.formation.capture import CaptureFormation
+    from cleargs.formation.dust import without_dust
     from cleargs.formation.exposure import Exposure, frame_gains, gain_spread, write_exposure
     from cleargs.formation.frames import real_views, seen_points
     from cleargs.formation.measured import load_paths
     from cleargs.formation.movement import TOLERANCE, write_movement
-    from cleargs.formation.observed import MAX_EVALUATED, evaluate_views, pooled_unseen
+    from cleargs.formation.observed import pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -100,8 +100,8 @@ def run(context: StageContext[G0Config]) -> StageResult:
         say=lambda remark: context.reporter.info(f"G0: {remark}"),
     )
     gains = frame_gains(views, sparse)
-    exposure_spread = gain_spread(gains)
-    alike = exposure_spread <= config.exposure_threshold
+    exposure_spread, colour_spread = gain_spread(gains)
+    alike = exposure_spread <= config.exposure_threshold and colour_spread <= config.colour_threshold
     off = config.exposure == "off" or (config.exposure == "auto" and alike)
     exposure = None if off else Exposure.from_gains(list(weights), gains)
     formation = CaptureFormation(
@@ -125,8 +125,8 @@ def run(context: StageContext[G0Config]) -> StageResult:
     trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
     learned = formation.exposure or Exposure.identity(list(weights))
     moving = formation.moving
-    few = spread(views, MAX_EVALUATED)
-    fits = evaluate_views(trained.scene.to(context.device), few, learned, formation.frames, moving=moving)
+    before = trained.scene.gaussians.num
+    trained, few, fits = without_dust(trained, views, learned, formation.frames, moving, context.device)
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
     write_exposure(context.out / "exposure.parquet", learned)
@@ -141,10 +141,12 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "views": len(views),
             "gaussians_start": gaussians.num,
             "gaussians": trained.scene.gaussians.num,
+            "gaussians_dropped": before - trained.scene.gaussians.num,
             "steps": config.length,
             "sh_degree": gaussians.sh_degree,
             "exposure": exposure is not None,
             "exposure_spread": exposure_spread,
+            "colour_spread": colour_spread,
             "moving_share": sum(float(cells.mean()) for cells in moving.values()) / len(views),
             "psnr_strong": mean_psnr(psnr[frame_id] for frame_id in strong if frame_id in psnr),
             "psnr_active": mean_psnr(psnr.values()),

@@ -67,7 +67,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update={"max_frames": frames, "max_size": size})
 
 
-VERSION = 18
+VERSION = 20
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -140,7 +140,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     from cleargs.capture.measuring import measure_motion, write_motion
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
-    from cleargs.capture.sfm import reconstruct
+    from cleargs.capture.sfm import contradictions, reconstruct
     from cleargs.capture.sources import open_capture
     from cleargs.media.image import read_rgb
 
@@ -160,9 +160,10 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     if len(capture.frames) < FEW_FRAMES:
         reporter.warn(f"there are only {len(capture.frames)} frames; a good scene needs 30 or more")
     long_side = max(config.feature_size, config.max_size)
-    capture = select_sharp_frames(capture, long_side, reporter)
+    capture = select_sharp_frames(capture, long_side, reporter, by_motion=config.fps is None)
     frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
+    scene = scene.turned_up(frames, reporter)
     scene, motion = measure_motion(capture, frames, scene, work, reporter)
     registered = {image.name for image in scene.model.images.values()}
     test = held_out(
@@ -174,9 +175,10 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     if config.holdout == "none":
         test = {index for index, frame in enumerate(frames) if frame.source.test}
     outcome = scene.outcome
-    model = publish(frames, scene.model, outcome.placed, test, work, context.out, config.max_size, reporter)
+    model = publish(frames, scene.model, outcome, test, work, context.out, config.max_size, reporter)
     write_motion(context.out / "motion.parquet", frames, motion)
     return StageResult(
+        missing=contradictions(outcome, config, reporter),
         summary={
             "kind": capture.kind,
             "input": capture.told,
@@ -184,6 +186,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
             "pose_convention": outcome.convention if capture.posed else None,
             "kept_out_matches_off_px": {name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
+            "kept_out": outcome.prediction and outcome.prediction.model_dump(),
             "cameras": scene.cameras(),
             **motion.summary(),
             "frames": len(frames),
@@ -195,6 +198,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "points": len(model.point_ids),
             "observations": sum(len(image.point_ids) for image in model.images.values()),
             "mean_reprojection_error_px": round(float(model.error.mean()), 6),
+            "up": "found" if scene.stood else "tops of the pictures",
             "similarity": scene.similarity.to_json(),
-        }
+        },
     )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import copy_without_features
 from cleargs.capture.kept_out import epipolar_errors, keep_out
+from cleargs.capture.prediction import Tracks
 
 FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
 """Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
@@ -46,16 +47,22 @@ class Adjuster:
     """Adjusts models to all matches in a database except every tenth track. These tracks measure errors."""
 
     def __init__(
-        self, database: Path, triangulate: Callable[[pycolmap.Reconstruction, Path], pycolmap.Reconstruction]
+        self,
+        database: Path,
+        triangulate: Callable[[pycolmap.Reconstruction, Path], pycolmap.Reconstruction],
+        like: Adjuster | None = None,
     ) -> None:
         """Copy ``database``, which does not change, without the tracks that are kept out.
 
         ``floor`` is the `median_error` with a separate geometry for each pair of frames. ``triangulate``
-        triangulates the points of a model again from the matches in a database.
+        triangulates the points of a model again from the matches in a database. Tracks that ``like`` keeps
+        out are kept out too.
         """
         self._cut = database.with_name(f"{database.stem}-cut.db")
         copy_without_features(database, self._cut, [])
-        self._kept_out, self.floor = keep_out(self._cut)
+        kept_out = keep_out(self._cut, None if like is None else like.tracks)
+        self._kept_out, self.floor = kept_out.matches, kept_out.floor
+        self.tracks: Tracks = kept_out.tracks
         self._triangulate = triangulate
 
     def errors(self, model: pycolmap.Reconstruction) -> NDArray[np.float64]:
@@ -102,20 +109,32 @@ class Adjuster:
         placed = [image for image in adjusted.images.values() if image.has_pose]
         return _anchored(adjusted, model, _held(adjusted) or placed)
 
-    def with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Return ``model``, with `FULL_LENS` if this lens explains the kept-out matches better."""
-        if lens_of(model) != FIRST_LENS:
-            return model
+    def with_measured_lens(
+        self, model: pycolmap.Reconstruction
+    ) -> tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]:
+        """Return ``model``, with `FULL_LENS` if this lens explains the kept-out matches better.
+
+        Also returns the model by which the kept-out matches judge it: the same one if the lens changed, else
+        one that is adjusted without them.
+        """
         start = self.adjust(_thinned(model), cameras=True)
+        if lens_of(model) != FIRST_LENS:
+            return model, start
         best = self._with_measured_lens(start)
         if best is start:
-            return model
+            return model, start
         if best.num_reg_frames() < model.num_reg_frames():
             whole = copy.deepcopy(model)
             for key, camera in whole.cameras.items():
                 camera.model, camera.params = best.cameras[key].model, best.cameras[key].params
-            return self.adjust(whole, cameras=True)
-        return _anchored(best, model, _held(best))
+            best = self.adjust(whole, cameras=True)
+        else:
+            best = _anchored(best, model, _held(best))
+        return best, best
+
+    def triangulated(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Return ``model`` with points from the matches that are not kept out."""
+        return self._triangulate(model, self._cut)
 
     def _with_measured_lens(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         full = copy.deepcopy(model)
@@ -126,14 +145,19 @@ class Adjuster:
 
     def bundle_adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
         """Return ``model`` after one bundle adjustment and a triangulation without the kept-out matches."""
-        options = pycolmap.BundleAdjustmentOptions(refine_focal_length=cameras, refine_extra_params=cameras)
-        options.print_summary = False
-        # A robust loss, because some matches are still wrong.
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.solver_options.num_threads = 1
-        options.ceres.solver_options.function_tolerance = _TOLERANCE
-        pycolmap.bundle_adjustment(model, options)
+        adjust_all(model, cameras=cameras)
         return self._triangulate(model, self._cut)
+
+
+def adjust_all(model: pycolmap.Reconstruction, *, cameras: bool = True) -> None:
+    """Adjust poses, points and, with ``cameras``, lenses of ``model`` in one bundle adjustment."""
+    options = pycolmap.BundleAdjustmentOptions(refine_focal_length=cameras, refine_extra_params=cameras)
+    options.print_summary = False
+    # A robust loss, because some matches are still wrong.
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.function_tolerance = _TOLERANCE
+    pycolmap.bundle_adjustment(model, options)
 
 
 def lens_of(model: pycolmap.Reconstruction) -> str:

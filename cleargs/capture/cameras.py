@@ -28,8 +28,14 @@ _FISHEYE = frozenset(
 _MODELS = _FISHEYE | {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 """Supported COLMAP models. Those of `_FISHEYE` bend straight lines even if all distortion terms are 0."""
 
-MAX_PARAMETER, MIN_FOCAL = 1e9, 1e-3
+MAX_ASPECT, MIN_FOCAL, MAX_FOCAL = 1.1, 0.3, 5.0
+"""Largest ratio of fx and fy, and range of the focal length in long sides, of a lens that is believed."""
+
+MAX_PARAMETER, SHORTEST_FOCAL = 1e9, 1e-3
 """Largest camera parameter, and shortest focal length in pixels. Beyond them pixels and rays overflow."""
+
+COLMAPS_GUESS = 1.2
+"""Focal length, in long sides, with which COLMAP starts if nothing is known."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -63,7 +69,7 @@ class Intrinsics:
             fault = "a camera has images without pixels"
         elif self.width * self.height > MAX_PIXELS:
             fault = f"a camera has more than {MAX_PIXELS} pixels"
-        elif not self.colmap().verify_params() or min(self.focal) < MIN_FOCAL:
+        elif not self.colmap().verify_params() or min(self.focal) < SHORTEST_FOCAL:
             fault = f"a {self.model} camera has a wrong number of parameters or a focal length of 0 or less"
         if fault:
             raise InputError(fault, hint="correct the camera in the input")
@@ -98,6 +104,13 @@ class Intrinsics:
         camera.rescale(width, height)
         return Intrinsics(self.model, width, height, tuple(camera.params.tolist()))
 
+    def moved(self, across: float, down: float) -> Intrinsics:
+        """Return the camera with its principal point moved, px."""
+        camera = self.colmap()
+        camera.principal_point_x += across
+        camera.principal_point_y += down
+        return Intrinsics(self.model, self.width, self.height, tuple(camera.params.tolist()))
+
     def colmap(self) -> pycolmap.Camera:
         """Return the pycolmap camera. The import is here, so that inputs can be looked up without it."""
         from cleargs.capture.colmap import pycolmap
@@ -111,11 +124,11 @@ def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float)
     return Intrinsics("PINHOLE", width, height, (fx, fy, cx, cy))
 
 
-def guessed_camera(model: str, width: int, height: int) -> Intrinsics:
-    """Return COLMAP's first guess without a known camera: focal length 1.2 long sides, no distortion."""
+def guessed_camera(model: str, width: int, height: int, share: float = COLMAPS_GUESS) -> Intrinsics:
+    """Return a camera without distortion whose focal length is ``share`` long sides."""
     from cleargs.capture.colmap import pycolmap
 
-    focal = 1.2 * max(width, height)
+    focal = share * max(width, height)
     guess = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
     return Intrinsics(model, width, height, tuple(guess.params.tolist()))
 
@@ -223,8 +236,11 @@ class Similarity:
             ) from error
 
 
-def normalise(poses: Sequence[Pose]) -> Similarity:
-    """Return the similarity to the normalised world. Raises InputError if all cameras are at one place."""
+def normalise(poses: Sequence[Pose], up: NDArray[np.float64] | None = None) -> Similarity:  # up [3]
+    """Return the similarity to the normalised world. Raises InputError if all cameras are at one place.
+
+    If ``up`` is None, it is the mean direction to the tops of the pictures.
+    """
     centres = np.stack([pose.centre for pose in poses])
     origin = centres[0] + (centres - centres[0]).mean(axis=0)
     scale = float(np.linalg.norm(centres - origin, axis=1).max())
@@ -233,11 +249,12 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
             "all cameras are at the same place: no point can be triangulated",
             hint="the camera must move, not only turn; check the poses, or set ingest.poses=sfm",
         )
-    up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
-    return Similarity(_up_rotation(up), origin, scale)
+    if up is None:
+        up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
+    return Similarity(upright(up), origin, scale)
 
 
-def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the smallest rotation that takes ``up`` to -y.
 
     If ``up`` is near +y, the axis of the smallest rotation depends on rounding errors. Then a half turn about

@@ -30,6 +30,8 @@ class SourceFrame:
     pose: Pose | None = None
     test: bool = False
     """True if the input names it as a test view."""
+    up: tuple[float, float, float] | None = None
+    """Up in the axes of its camera (x right, y down, z ahead), where the input states it."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.layouts.video import video_frame
+from cleargs.capture.pace import Pace, even_places
 from cleargs.errors import InputError
 from cleargs.media.image import reduced
 from cleargs.media.video import decode_grey, read_timeline
@@ -23,20 +24,27 @@ from cleargs.types import ImageU8
 _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 
 
-def select_sharp_frames(capture: Capture, long_side: int, reporter: Reporter) -> Capture:
+def select_sharp_frames(
+    capture: Capture, long_side: int, reporter: Reporter, *, by_motion: bool = True
+) -> Capture:
     """Return ``capture`` with each frame of a video replaced by the sharpest of its stretch of time.
 
     The stretch of a frame of ``capture`` is all frames of the video that are nearer in time to it than to the
-    other ones. Ties go to the earlier frame. Each video is decoded once.
+    other ones. Ties go to the earlier frame. Each video is decoded once. With ``by_motion``, the stretches
+    of a video whose pace is uneven have the same motion, not the same duration.
     """
     if capture.kind != "video":
         return capture
     videos = dict.fromkeys(frame.path for frame in capture.frames)
-    chosen = (frame for video in videos for frame in _sharpest_of(video, capture, long_side, reporter))
+    chosen = (
+        frame for video in videos for frame in _sharpest_of(video, capture, long_side, reporter, by_motion)
+    )
     return replace(capture, frames=tuple(chosen))
 
 
-def _sharpest_of(video: Path, capture: Capture, long_side: int, reporter: Reporter) -> list[SourceFrame]:
+def _sharpest_of(
+    video: Path, capture: Capture, long_side: int, reporter: Reporter, by_motion: bool
+) -> list[SourceFrame]:
     """Return the sharpest frame of each stretch of ``video``."""
     frames = [frame for frame in capture.frames if frame.path == video]
     timeline = read_timeline(video).between(*capture.stretch)
@@ -44,21 +52,30 @@ def _sharpest_of(video: Path, capture: Capture, long_side: int, reporter: Report
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, timeline.pts)
     if len(nearest) == len(times):
         return frames
-    best = np.full(len(times), -1.0)
-    chosen = [0] * len(times)
+    values, pace, seen = np.full(len(nearest), -1.0), Pace(), []
     numbers = {pts: number for number, pts in enumerate(timeline.pts)}
     with reporter.task("looking for sharp frames", len(numbers)) as task:
         for pts, grey in decode_grey(video, numbers):
-            number = numbers[pts]
-            place, value = nearest[number], sharpness(reduced(grey, long_side))
-            if value > best[place]:
-                best[place], chosen[place] = value, number
+            seen.append(numbers[pts])
+            picture = reduced(grey, long_side)
+            values[seen[-1]] = sharpness(picture)
+            pace.add(picture)
             task.advance()
-    if (best < 0.0).any():
+    stretches = [np.flatnonzero(nearest == place) for place in range(len(times))]
+    if any((values[stretch] < 0.0).all() for stretch in stretches):
         raise InputError(
             f"{video.name}: of a stretch of it no frame can be decoded",
             hint="convert the video with ffmpeg, or cut the damaged part off",
         )
+    if by_motion:
+        distances = np.interp(np.arange(len(nearest)), seen, pace.distances())
+        places = even_places(
+            distances, np.array([numbers[frame.pts] for frame in frames if frame.pts is not None])
+        )
+        if places is not None:
+            reporter.info(f"{video.name}: the pace is uneven; frames are taken by the motion of the picture")
+            stretches = [np.flatnonzero(places == place) for place in np.unique(places)]
+    chosen = [int(stretch[values[stretch].argmax()]) for stretch in stretches]
     prefix = frames[0].name.rpartition("_")[0]
     return [video_frame(video, timeline, number, prefix) for number in chosen]
 

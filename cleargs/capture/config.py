@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Literal
 
 from pydantic import Field, field_validator
@@ -10,6 +12,10 @@ from cleargs.base_model import FrozenModel
 from cleargs.plugins import require_known
 
 SfmModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+
+
+_FOCAL, _DEGREES = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(|px|deg|degrees|°)\s*"), ("deg", "degrees", "°")
+_WIDEST = math.radians(170)  # field of view with which a perspective lens starts at most
 
 
 class CaptureConfig(FrozenModel):
@@ -23,7 +29,10 @@ class CaptureConfig(FrozenModel):
         "alone decides",
     )
     max_frames: int = Field(
-        150, ge=3, description="most frames to take, evenly; in a video, the sharpest nearby"
+        150,
+        ge=3,
+        description="most frames to take, evenly; in a video, the sharpest nearby, and evenly by the motion "
+        "of the picture if the pace is uneven and fps is unset",
     )
     start: float | None = Field(
         None, ge=0, description="take a video from this time on, s; unset: from its first frame on"
@@ -80,8 +89,39 @@ class SfmConfig(FrozenModel):
         "error of matches that the fit did not use",
     )
     shared_camera: bool = Field(
-        True, description="SfM: one camera for all frames of one size and lens; false: a camera per frame"
+        True,
+        description="SfM: one camera for all frames of one size and lens, unless the focal length changes; "
+        "false: a camera per frame",
     )
+    focal: str | None = Field(
+        None,
+        coerce_numbers_to_str=True,
+        description="SfM: focal length to start with, px of the input's images (450px), or field of view "
+        "across the long side (65deg); unset: by EXIF, else a guess",
+    )
+
+    @field_validator("focal")
+    @classmethod
+    def _focal_is_a_length_or_an_angle(cls, value: str | None) -> str | None:
+        if value is not None:
+            found = _FOCAL.fullmatch(value)
+            if not found or not 0 < float(found[1]) < (360 if found[2] in _DEGREES else 1e6):
+                raise ValueError("expected a focal length such as 450px, or a field of view such as 65deg")
+        return value
+
+    def focal_share(self, model: str, long_side: int) -> float:
+        """Return the ``focal`` that is set, in long sides of the image, for a camera ``model`` of COLMAP.
+
+        ``long_side`` is that of the input's image, px. A field of view means another focal length in a
+        fisheye.
+        """
+        found = _FOCAL.fullmatch(self.focal or "")
+        assert found is not None  # as validated
+        if found[2] not in _DEGREES:
+            return float(found[1]) / long_side
+        angle = math.radians(float(found[1]))
+        return 1 / angle if "FISHEYE" in model else 0.5 / math.tan(min(angle, _WIDEST) / 2)
+
     max_features: int = Field(
         4096, ge=256, le=65536, description="SIFT features per frame, the largest scales first"
     )

@@ -42,6 +42,15 @@ def create_database(database: Path, job: Job) -> None:
             opened.write_frame(frame, use_frame_id=True)
 
 
+def copy_features(source: Path, target: Path) -> None:
+    """Copy features and matches of all images from one database to another."""
+    with closing(sqlite3.connect(target)) as opened:
+        opened.execute("ATTACH ? AS source", (str(source),))
+        for table in ("keypoints", "descriptors", "matches", "two_view_geometries"):
+            opened.execute(f"INSERT OR REPLACE INTO {table} SELECT * FROM source.{table}")
+        opened.commit()
+
+
 def set_cameras(database: Path, cameras: Sequence[pycolmap.Camera]) -> None:
     with pycolmap.Database.open(database) as opened:
         for camera in cameras:
@@ -55,6 +64,8 @@ def colmap_cameras(job: Job) -> list[pycolmap.Camera]:
         camera = pycolmap.Camera(**asdict(known), camera_id=number + 1)
         if image is not None:
             apply_exif_focal(camera, image)
+        if job.focal_known:
+            camera.has_prior_focal_length = True
         cameras.append(camera)
     return cameras
 

@@ -7,6 +7,7 @@ matches that were kept out of the fit show which of two fits is better.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from cleargs.capture.colmap import pycolmap
+from cleargs.capture.prediction import Tracks
 
 HELD_OUT = 10
 """Every tenth track is kept out."""
@@ -33,11 +35,24 @@ Matches = dict[tuple[int, int], tuple[Pixels, Pixels]]
 """Pair of image ids -> pixels in the first and in the second image, [K, 2] each."""
 
 
+@dataclass(frozen=True, eq=False)
+class KeptOut:
+    """Matches and tracks that `keep_out` removed from a database."""
+
+    matches: Matches
+    tracks: Tracks
+    """The tracks of the matches, without those that have two keypoints in a frame: some of their matches are
+    wrong."""
+    floor: float
+    """Median distance, px, of the matches from the epipolar lines of the fundamental matrices that COLMAP
+    fitted to each pair alone; 0 if no pair has a matrix. No poses explain the matches much better."""
+
+
 def verified_matches(database: Path) -> Matches:
     """Return the matches in ``database`` that COLMAP verified."""
     with pycolmap.Database.open(database) as opened:
-        pixels = _pixels(opened)
-        found = {pair: geometry.inlier_matches for pair, geometry in _geometries(opened).items()}
+        pixels = pixels_in(opened)
+        found = {pair: geometry.inlier_matches for pair, geometry in geometries_in(opened).items()}
     return {
         (one, two): (pixels[one][rows[:, 0]], pixels[two][rows[:, 1]])
         for (one, two), rows in found.items()
@@ -45,34 +60,28 @@ def verified_matches(database: Path) -> Matches:
     }
 
 
-def keep_out(database: Path) -> tuple[Matches, float]:
-    """Remove every `HELD_OUT`-th track from the verified matches in ``database``.
+def keep_out(database: Path, also: Tracks | None = None) -> KeptOut:
+    """Remove every `HELD_OUT`-th track, and those with keypoints of ``also``, from the verified matches.
 
     A track is the set of features that matches connect. Its matches are kept out together, since any of them
-    would help to fit its point. Returns the removed matches, and their median distance, px, from the epipolar
-    lines of the fundamental matrices that COLMAP fitted to each pair alone (0 if no pair has a matrix). No
-    poses explain the matches much better than these matrices.
+    would help to fit its point.
     """
     kept_out: Matches = {}
     alone = [np.zeros(0)]
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
-        pixels, geometries = _pixels(opened), _geometries(opened)
+        pixels, geometries = pixels_in(opened), geometries_in(opened)
+        start, edges, tracks = _connected(pixels, geometries)
         sizes = [len(xy) for xy in pixels.values()]
-        start = dict(zip(pixels, np.cumsum([0, *sizes]).tolist(), strict=False))
-        edges = {
-            (one, two): np.reshape(geometry.inlier_matches, (-1, 2)).astype(np.int64)
-            + np.array([start[one], start[two]])
-            for (one, two), geometry in geometries.items()
-        }
-        a, b = np.concatenate([np.zeros((0, 2), np.int64), *edges.values()]).T
-        graph = coo_array((np.ones(len(a)), (a, b)), shape=(sum(sizes),) * 2)
-        tracks = connected_components(graph)[1]
         # Identified by its first feature, a track is the same in another database.
         first = np.unique(tracks, return_index=True)[1]
         owner = np.repeat(list(pixels), sizes)[first]
         number = first - np.array([start[key] for key in owner.tolist()], np.int64)
         # Wrong matches join tracks: a track with more features than there are images is not a real one.
         chosen = ((owner + number) % HELD_OUT == 0) & (np.bincount(tracks) <= len(pixels))
+        if also is not None:
+            known = also.keypoint < np.array([len(pixels[key]) for key in also.image.tolist()], np.int64)
+            features = also.keypoint + np.array([start[key] for key in also.image.tolist()], np.int64)
+            chosen[tracks[features[known]]] = True
         for (one, two), geometry in geometries.items():
             rows, out = np.asarray(geometry.inlier_matches), chosen[tracks[edges[one, two][:, 0]]]
             if out.any():
@@ -82,7 +91,49 @@ def keep_out(database: Path) -> tuple[Matches, float]:
                 geometry.inlier_matches = rows[~out]
                 opened.update_two_view_geometry(one, two, geometry)
     errors = np.concatenate(alone)
-    return kept_out, float(np.median(errors)) if len(errors) else 0.0
+    floor = float(np.median(errors)) if len(errors) else 0.0
+    return KeptOut(kept_out, _unambiguous(pixels, tracks, chosen), floor)
+
+
+def all_tracks(database: Path) -> Tracks:
+    """Return the tracks of all verified matches in ``database``."""
+    with pycolmap.Database.open(database) as opened:
+        pixels, geometries = pixels_in(opened), geometries_in(opened)
+    _, _, tracks = _connected(pixels, geometries)
+    return _unambiguous(pixels, tracks, np.ones(tracks.max(initial=-1) + 1, bool))
+
+
+def _connected(
+    pixels: Mapping[int, Pixels], geometries: Mapping[tuple[int, int], pycolmap.TwoViewGeometry]
+) -> tuple[dict[int, int], dict[tuple[int, int], NDArray[np.int64]], NDArray[np.int64]]:
+    """Return the number of each image's first feature, the matches of each pair, and each feature's track.
+
+    Matches are pairs of the numbers of features, which count over all images.
+    """
+    sizes = [len(xy) for xy in pixels.values()]
+    start = dict(zip(pixels, np.cumsum([0, *sizes]).tolist(), strict=False))
+    edges = {
+        (one, two): np.reshape(geometry.inlier_matches, (-1, 2)).astype(np.int64)
+        + np.array([start[one], start[two]])
+        for (one, two), geometry in geometries.items()
+    }
+    a, b = np.concatenate([np.zeros((0, 2), np.int64), *edges.values()]).T
+    graph = coo_array((np.ones(len(a)), (a, b)), shape=(sum(sizes),) * 2)
+    return start, edges, connected_components(graph)[1]
+
+
+def _unambiguous(
+    pixels: Mapping[int, Pixels], tracks: NDArray[np.int64], chosen: NDArray[np.bool_]
+) -> Tracks:
+    """Return the ``chosen`` tracks of at least two features, without those with two features in an image."""
+    images = np.repeat(np.array(list(pixels), np.int64), [len(xy) for xy in pixels.values()])
+    numbers = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(xy)) for xy in pixels.values())])
+    members = np.flatnonzero((chosen & (np.bincount(tracks) > 1))[tracks])
+    members = members[np.argsort(tracks[members], kind="stable")]
+    shown, counts = np.unique(np.stack([tracks[members], images[members]]), axis=1, return_counts=True)
+    members = members[~np.isin(tracks[members], shown[0, counts > 1])]
+    places = np.concatenate([np.zeros((0, 2)), *pixels.values()])[members]
+    return Tracks(images[members], tracks[members].astype(np.int64), numbers[members], places)
 
 
 def epipolar_errors(
@@ -139,7 +190,7 @@ def weakest_join(model: pycolmap.Reconstruction, database: Path) -> tuple[int, f
     }
     counts, holding = np.zeros((2, max(points, default=0) + 1))
     with pycolmap.Database.open(database) as opened:
-        geometries = _geometries(opened)
+        geometries = geometries_in(opened)
     for (one, two), geometry in geometries.items():
         if one in points and two in points and len(geometry.inlier_matches):
             first, second = (points[key][geometry.inlier_matches[:, k]] for k, key in enumerate((one, two)))
@@ -154,11 +205,11 @@ def _distances(first: Any, second: Any, matrix: NDArray[np.float64]) -> NDArray[
     return np.sqrt(pycolmap.compute_squared_sampson_error(first, second, matrix))
 
 
-def _pixels(opened: pycolmap.Database) -> dict[int, Pixels]:
+def pixels_in(opened: pycolmap.Database) -> dict[int, Pixels]:
     images = sorted(image.image_id for image in opened.read_all_images())
     return {key: np.asarray(opened.read_keypoints(key), np.float64)[:, :2] for key in images}
 
 
-def _geometries(opened: pycolmap.Database) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+def geometries_in(opened: pycolmap.Database) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
     pair_ids, geometries = opened.read_two_view_geometries()
     return dict(zip(map(pycolmap.pair_id_to_image_pair, pair_ids), geometries, strict=True))

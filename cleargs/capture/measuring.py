@@ -106,7 +106,9 @@ def measure_motion(
     """
     model = scene.model
     status = {frame.image: "no neighbours in the input" for frame in frames}
-    none = CameraMotion({}, status, _lenses(frames, model), {}, capture.has_clock)
+    none = CameraMotion(
+        {}, status, _lenses(frames, model, found=scene.outcome.method == "sfm"), {}, capture.has_clock
+    )
     folder = work / "motion"
     status |= _follow(capture, frames, model, folder, reporter)
     if TRACKED not in status.values():
@@ -161,11 +163,19 @@ def _follow(
     return {name: TRACKED if name in tracked else "repeated frames" for name in names}
 
 
-def _lenses(frames: Sequence[WorkFrame], model: SparseModel) -> dict[str, int]:
-    """Return the number of the lens of each frame of ``model``: a camera in one video, or in a folder."""
+def _lenses(frames: Sequence[WorkFrame], model: SparseModel, *, found: bool) -> dict[str, int]:
+    """Return the number of the lens of each frame of ``model``: a camera in one video, or in a folder.
+
+    If SfM gave each frame its own camera, all frames of a video or folder have the same lens: it zooms, or a
+    stabiliser moves the picture.
+    """
     by_name = {image.name: image.camera_id for image in model.images.values()}
+    zooms = found and len(set(by_name.values())) == len(by_name)
     owners = {
-        frame.image: (by_name[frame.image], frame.source.path if frame.source.pts is not None else None)
+        frame.image: (
+            0 if zooms else by_name[frame.image],
+            frame.source.path if frame.source.pts is not None else None,
+        )
         for frame in frames
         if frame.image in by_name
     }

@@ -6,7 +6,7 @@ https://colmap.github.io/format.html
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -65,6 +65,17 @@ class SparseModel:
         """Return the model in another world; every point keeps its place in every image."""
         images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in self.images.items()}
         return replace(self, images=images, xyz=similarity.points(self.xyz))
+
+    def shifted(self, shifts: Mapping[str, tuple[float, float]]) -> SparseModel:
+        """Return the model with a camera per image, its centre moved by ``shifts``, px."""
+        if not shifts:
+            return self
+        images = {key: replace(image, camera_id=key) for key, image in self.images.items()}
+        cameras = {
+            key: self.cameras[image.camera_id].moved(*shifts.get(image.name, (0.0, 0.0)))
+            for key, image in self.images.items()
+        }
+        return replace(self, cameras=cameras, images=images)
 
     def misses(self) -> NDArray[np.float64]:
         """Return the distance of every keypoint from its projected point, px; infinite behind the camera."""

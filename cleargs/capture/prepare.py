@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from cleargs.capture.behind import StillRoom, still_room
 from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
-from cleargs.capture.overlay import still_parts, wraps_around
+from cleargs.capture.cutouts import are_cut_outs, resampled
+from cleargs.capture.overlay import without_scene, wraps_around
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
 from cleargs.media.image import (
@@ -21,6 +23,7 @@ from cleargs.media.image import (
     read_alpha,
     read_mask,
     read_rgb,
+    read_transparency,
     reduced,
     write_mask,
     write_rgb,
@@ -46,6 +49,8 @@ class WorkFrame:
     camera: Intrinsics | None
     transparent: bool = False
     """True if the mask of the frame is the transparency of its image."""
+    cut_out: bool = False
+    """True if transparent pixels are empty; the alpha is below the folder of alphas, named like the image."""
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
@@ -55,15 +60,25 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     a killed run stay. Raises InputError for an unreadable image, an image without the proportions of its
     camera, or a panorama.
     """
-    images, masks = folder / "images", folder / "masks"
+    images, masks, alphas = folder / "images", folder / "masks", folder / "alphas"
     make_folder(images)
     make_folder(masks)
     paths = [images / f"{index:06d}.png" for index in range(len(capture.frames))]
     pairs = list(zip(capture.frames, paths, strict=True))
+    cut_out = all(frame.pts is None for frame in capture.frames) and are_cut_outs(
+        [frame.path for frame in capture.frames]
+    )
+    if cut_out:
+        make_folder(alphas)
     with reporter.task("reading frames", len(paths)) as task:
         todo = {path: frame for frame, path in pairs if not _is_intact(path, reporter)}
         task.update(done=len(paths) - len(todo))
         for path, rgb in _pictures(todo):
+            if cut_out:
+                alpha = read_transparency(todo[path].path, upright=not is_as_stored(todo[path]))
+                assert alpha is not None  # `are_cut_outs`
+                rgb, alpha = resampled(rgb, alpha, lambda picture: reduced(picture, long_side))
+                write_mask(alphas / path.name, alpha)
             write_rgb(path, reduced(rgb, long_side))
             task.advance()
     if all(
@@ -74,13 +89,30 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             "the pictures are equirectangular panoramas, which show all directions",
             hint="cut perspective views out of them first (ffmpeg's filter v360 does), and give these",
         )
-    still = still_parts(paths)
-    if still is not None:
+    unused = None if cut_out else without_scene(paths)
+    if unused is not None and unused.border.any():
         reporter.warn(
-            f"{(still == 0).mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
+            f"{unused.border.mean():.1%} of the pixels are a border around the picture (bars, a lens hood): "
             "masked in all frames"
         )
-    prepared = [_work_frame(frame, path, masks / f"{path.name}.png", still) for frame, path in pairs]
+    if unused is not None and unused.still.any():
+        reporter.warn(
+            f"{unused.still.mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
+            "masked in all frames"
+        )
+    still = None if unused is None else unused.mask
+    room = None if cut_out else still_room(paths)
+    if room is not None:
+        reporter.warn(
+            f"two motions: {room.share:.0%} of the picture is still in most frames (the room of a turntable, "
+            "a dashboard, a screen), and the rest moves. The still part is masked, the rest is reconstructed"
+        )
+    prepared = [
+        _work_frame(frame, path, masks / f"{path.name}.png", _unseen(path, still, room))
+        for frame, path in pairs
+    ]
+    if cut_out:
+        prepared = [replace(made, cut_out=True) for made in prepared]
     if any(made.masked for made in prepared):
         for made in prepared:  # COLMAP leaves out an image without a mask if others have one
             mask = masks / f"{made.image}.png"
@@ -88,10 +120,17 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
                 write_mask(mask, np.full((made.height, made.width), 255, np.uint8))
     transparent = sum(made.transparent for made in prepared)
     if transparent:
-        reporter.info(
-            f"{transparent} of {len(prepared)} images are transparent in places: ignored, like masks"
-        )
+        what = "empty there" if cut_out else "ignored, like masks"
+        reporter.info(f"{transparent} of {len(prepared)} images are transparent in places: {what}")
     return prepared
+
+
+def _unseen(path: Path, still: MaskU8 | None, room: StillRoom | None) -> MaskU8 | None:  # [H, W]
+    """Return the mask of the working image ``path`` without its still parts, or None."""
+    if room is None:
+        return still
+    mask = room.mask(read_rgb(path))
+    return mask if still is None else np.minimum(mask, still)
 
 
 def _is_intact(image: Path, reporter: Reporter) -> bool:
@@ -119,10 +158,10 @@ def _pictures(frames: Mapping[Path, SourceFrame]) -> Iterator[tuple[Path, ImageU
 
 def read_image(frame: SourceFrame) -> ImageU8:  # [H, W, 3]
     """Return the image, turned by its EXIF orientation unless the frame's camera fits the stored image."""
-    return read_rgb(frame.path, upright=not _is_as_stored(frame))
+    return read_rgb(frame.path, upright=not is_as_stored(frame))
 
 
-def _is_as_stored(frame: SourceFrame) -> bool:
+def is_as_stored(frame: SourceFrame) -> bool:
     """Return True if the frame's camera fits the stored image, on which COLMAP works.
 
     A half turn keeps the proportions. Then the camera counts as fitting.
@@ -176,7 +215,7 @@ def read_stencil(frame: SourceFrame) -> MaskU8 | None:
     """Return the mask of the frame, else the transparency of its image; None if all pixels count."""
     if frame.mask is not None:
         return read_mask(frame.mask, _turn_of_mask(frame, frame.mask))
-    return None if frame.pts is not None else read_alpha(frame.path, upright=not _is_as_stored(frame))
+    return None if frame.pts is not None else read_alpha(frame.path, upright=not is_as_stored(frame))
 
 
 def _turn_of_mask(frame: SourceFrame, mask: Path) -> int:
@@ -185,7 +224,7 @@ def _turn_of_mask(frame: SourceFrame, mask: Path) -> int:
     The proportions decide. If they are the same, as for half turns and squares, a mask with the full name
     of its image (COLMAP's form, and COLMAP turns no image) is one of the stored pixels, another one is not.
     """
-    turn = 1 if frame.pts is not None or _is_as_stored(frame) else orientation(frame.path)
+    turn = 1 if frame.pts is not None or is_as_stored(frame) else orientation(frame.path)
     if turn == 1:
         return 1
     stored, made = image_size(frame.path), image_size(mask)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +12,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics, guessed_camera
+from cleargs.capture.cutouts import resampled, write_cut_out
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.prepare import WorkFrame
+from cleargs.capture.sfm_job import Prediction, SfmOutcome
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.capture.undistort import undistorter
 from cleargs.errors import StageError
 from cleargs.files import make_folder, remove
-from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
+from cleargs.media.image import read_grey, read_mask, read_rgb, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.progress import Reporter
 
@@ -26,7 +28,7 @@ from cleargs.progress import Reporter
 def publish(
     frames: Sequence[WorkFrame],
     model: SparseModel,
-    placed: Mapping[str, str],
+    outcome: SfmOutcome,
     test: set[int],
     work: Path,
     out: Path,
@@ -37,7 +39,7 @@ def publish(
 
     The colours of points are from train frames. Points are left out if no train frame shows them, or if fewer
     than two frames show them after undistortion cropped the images. Returns the published model. ``model`` is
-    that of the working images in ``work``, ``placed`` says how the pose of each was found or why there is
+    that of the working images in ``work``, ``outcome`` says how the pose of each was found or why there is
     none, and ``test`` are the numbers of the test frames.
     """
     make_folder(out / "images", empty=True)
@@ -56,8 +58,17 @@ def publish(
         for index, (frame, lens) in enumerate(zip(frames, lenses, strict=True)):
             undistortion = undistorters[lens]
             flat.append(undistortion.pinhole)
-            rgb = undistortion.image(read_rgb(work / "images" / frame.image))
-            write_rgb(out / "images" / frame.image, rgb)
+            rgb = read_rgb(work / "images" / frame.image)
+            if frame.cut_out:
+                alpha = read_grey(work / "alphas" / frame.image)
+                rgb, alpha = resampled(rgb, alpha, undistortion.image)
+                if frame.source.mask is not None:  # ignored pixels are not empty
+                    ignored = undistortion.mask(read_mask(work / "masks" / f"{frame.image}.png")) == 0
+                    alpha = np.where(ignored, np.uint8(255), alpha)
+                write_cut_out(out / "images" / frame.image, rgb, alpha)
+            else:
+                rgb = undistortion.image(rgb)
+                write_rgb(out / "images" / frame.image, rgb)
             if frame.masked:
                 mask = read_mask(work / "masks" / f"{frame.image}.png")
                 write_mask(out / "masks" / frame.image, undistortion.mask(mask))
@@ -85,7 +96,8 @@ def publish(
         {
             "frame_id": index,
             "split": "test" if index in test else "train",
-            "placed": placed[frame.image],
+            "placed": outcome.placed[frame.image],
+            **_kept_out(outcome.predictions.get(frame.image)),
             **_frame_row(frame, camera, published.images.get(index + 1)),
         }
         for index, (frame, camera) in enumerate(zip(frames, flat, strict=True))
@@ -126,6 +138,14 @@ def _write_points(
         "point_id": np.concatenate([ids for _, ids in seen]),
     }
     write_table(out / "observations.parquet", pa.table(observations, OBSERVATIONS), OBSERVATIONS)
+
+
+def _kept_out(found: Prediction | None) -> dict[str, object]:
+    return {
+        "kept_out_keypoints": found and found.keypoints,
+        "kept_out_share": found and found.share,
+        "kept_out_px": found and found.median_px,
+    }
 
 
 def _frame_row(frame: WorkFrame, camera: Intrinsics, image: ModelImage | None) -> dict[str, object]:

@@ -11,30 +11,58 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from cleargs.capture.adjustment import FIRST_LENS
-from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
+from cleargs.capture.cameras import (
+    COLMAPS_GUESS,
+    MAX_ASPECT,
+    MAX_FOCAL,
+    MIN_FOCAL,
+    Intrinsics,
+    Pose,
+    Similarity,
+    guessed_camera,
+    normalise,
+    upright,
+)
 from cleargs.capture.child import run_child
-from cleargs.capture.config import SfmConfig
+from cleargs.capture.config import SfmConfig, SfmModel
 from cleargs.capture.database import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import (
+    GOOD_SHARE,
+    LEAST_SHARE,
+    MIN_KEYPOINTS,
+    NO_DEPTH,
+    OUTCOME,
+    OWN,
+    Job,
+    SfmOutcome,
+)
+from cleargs.capture.upright import find_up, stated_up
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
-from cleargs.media.image import lens_name, stated_focal
+from cleargs.media.image import image_size, lens_name, stated_focal
+from cleargs.media.video import video_size
 from cleargs.progress import Reporter
 from cleargs.safe_io import faults_as, read_json
+
+JUMP = 0.05
+"""Change of the logarithm of the focal length from one frame to the next that is named."""
 
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, where the farthest camera has distance 1."""
 
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
+
+_DOUBT = "state the lens (ingest.focal, ingest.camera_model), or record slower, with more light and texture"
 
 _ADVICE = (
     "record more frames (ingest.fps, ingest.max_frames) with slower motion, "
@@ -49,6 +77,8 @@ class Reconstruction:
     model: SparseModel
     similarity: Similarity
     outcome: SfmOutcome
+    stood: bool = False
+    """True if its up is not the mean direction to the tops of the pictures (`find_up`)."""
 
     def with_model(self, model: SparseModel) -> tuple[Reconstruction, float]:
         """Return the reconstruction with an adjusted ``model``, and the factor by which its lengths changed.
@@ -57,14 +87,40 @@ class Reconstruction:
         """
         if self.outcome.method != "sfm":
             return replace(self, model=model), 1.0
-        again = normalise([image.pose for _, image in sorted(model.images.items())])
+        up = np.array([0.0, -1.0, 0.0]) if self.stood else None
+        again = normalise([image.pose for _, image in sorted(model.images.items())], up)
         return replace(
             self, model=model.moved(again), similarity=self.similarity.then(again)
         ), 1 / again.scale
 
+    def turned_up(self, frames: Sequence[WorkFrame], reporter: Reporter) -> Reconstruction:
+        """Return the reconstruction with up as `find_up` finds it. A guess is reported."""
+        files = {frame.image: frame.source for frame in frames}
+        stated = {
+            name: stated_up(source.path) if source.up is None and source.pts is None else source.up
+            for name, source in files.items()
+        }
+        up, told = find_up(self.model, {name: np.array(up) for name, up in stated.items() if up is not None})
+        if told:
+            reporter.info(told)
+        if up is None:
+            return self
+        turn = Similarity(upright(up), np.zeros(3), 1.0)
+        turned = self.model.moved(turn)
+        return replace(self, model=turned, similarity=self.similarity.then(turn), stood=True)
+
     def cameras(self) -> list[dict[str, Any]]:
-        """Return lens, mean focal length (px) and number of frames of each camera."""
+        """Return lens, mean focal length (px) and number of frames of each camera.
+
+        If each frame has its own, they are one row, with the median and the range of the focal lengths.
+        """
         frames = Counter(image.camera_id for image in self.model.images.values())
+        used = [self.model.cameras[key] for key in frames]
+        if len(frames) > 1 and max(frames.values()) == 1 and len({camera.model for camera in used}) == 1:
+            focal = np.array([sum(camera.focal) / 2 for camera in used]).round(3)
+            row = {"lens": used[0].model, "focal_px": round(float(np.median(focal)), 3), "frames": len(used)}
+            ends = [float(focal.min()), float(focal.max())]
+            return [row if ends[0] == ends[1] else {**row, "focal_range_px": ends}]
         return [
             {"lens": camera.model, "focal_px": round(sum(camera.focal) / 2, 3), "frames": frames[key]}
             for key, camera in self.model.cameras.items()
@@ -95,8 +151,8 @@ def reconstruct(
         job = job_of(frames, None, folder, config, seed, threads)
         try:
             model, outcome = _found(job, reporter)
-        except StageError:
-            if not any(map(stated_focal, filter(None, job.exif_images))):
+        except StageError as error:
+            if str(error) == NO_DEPTH or not any(map(stated_focal, filter(None, job.exif_images))):
                 raise
             reporter.warn(
                 "with the focal length in the EXIF data of the images too few frames could be placed: "
@@ -107,6 +163,13 @@ def reconstruct(
             job = job.model_copy(update={"folder": alone, "exif_images": [None] * len(job.exif_images)})
             model, outcome = _found(job, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
+        _report_lens(model, frames, config, reporter)
+        if outcome.shifts_px:
+            reach = max(abs(shift) for pair in outcome.shifts_px.values() for shift in pair)
+            reporter.warn(
+                f"the picture moves by up to {reach:.0f} px against the lens, as in stabilised video: each "
+                "frame gets its own image centre. Film without stabilisation if you can"
+            )
         if outcome.torn_at is not None:
             reporter.warn(
                 f"the frames before {frames[outcome.torn_at].source.name} may be at another scale: "
@@ -148,6 +211,62 @@ def reconstruct(
     if adopted is not None and len(adopted.error) and not stale and outcome.method == "given":
         model = adopted
     return Reconstruction(model, worlds[outcome.convention][0], outcome)
+
+
+def _report_lens(
+    model: SparseModel, frames: Sequence[WorkFrame], config: SfmConfig, reporter: Reporter
+) -> None:
+    """Say which frames a focal length that changes is shortest and longest in, and warn of a strange lens."""
+    lenses = [model.cameras[key] for key in sorted({image.camera_id for image in model.images.values()})]
+    ratios = [max(lens.focal) / min(lens.focal) for lens in lenses]
+    shares = [sum(lens.focal) / 2 / max(lens.width, lens.height) for lens in lenses]
+    usual = config.focal is not None or MIN_FOCAL <= min(shares) <= max(shares) <= MAX_FOCAL
+    if max(ratios) > MAX_ASPECT or not usual:
+        lens = lenses[int(np.argmax(ratios))] if max(ratios) > MAX_ASPECT else lenses[0]
+        fx, fy = lens.focal
+        reporter.warn(
+            f"almost no lens is like this one: focal lengths {fx:.0f} and {fy:.0f} px for images of "
+            f"{lens.width}x{lens.height}; state the lens (ingest.focal, ingest.camera_model)"
+        )
+    if config.shared_camera and len(lenses) == len(model.images) > 1 and min(shares) < max(shares):
+        named = {frame.image: frame.source.name for frame in frames}
+        focal = {
+            named[image.name]: sum(model.cameras[image.camera_id].focal) / 2
+            for image in model.images.values()
+        }
+        short, long = (choice(focal, key=lambda name: focal[name]) for choice in (min, max))
+        names = list(focal)
+        jumps = [two for one, two in pairwise(names) if abs(np.log(focal[two] / focal[one])) > JUMP]
+        at = f", with jumps at {', '.join(jumps[:5])}" if jumps else ""
+        reporter.warn(
+            f"the focal length changes from frame to frame: {focal[short]:.0f} px in {short}, "
+            f"{focal[long]:.0f} px in {long}{at}; each frame has its own camera"
+        )
+
+
+def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -> tuple[str, ...]:
+    """Report the errors of the cameras at the kept-out keypoints. Return a line if these contradict them.
+
+    Raises StageError if found cameras are so wrong that no scene is possible. Poses of the input that
+    ``config.refine_above`` keeps give a warning only.
+    """
+    found = outcome.prediction
+    if found is None or found.keypoints < MIN_KEYPOINTS:
+        return ()
+    figure = (
+        f"of {found.keypoints} keypoints that took no part in the fit, {found.share:.0%} are within 2 px of "
+        f"their places (median {found.median_px:.2g} px)"
+    )
+    if found.share < LEAST_SHARE and outcome.method == "sfm":
+        raise StageError(f"the cameras are wrong: {figure}", hint=_DOUBT)
+    kept = outcome.method == "given" and (outcome.missed_px or 0.0) <= config.refine_above
+    if found.share < GOOD_SHARE and kept:
+        reporter.warn(f"the poses of the input are doubtful: {figure}; ingest.refine_above keeps them")
+    elif found.share < GOOD_SHARE:
+        return (f"cameras that the images confirm: {figure}, fewer than {GOOD_SHARE:.0%}; {_DOUBT}",)
+    else:
+        reporter.info(f"cameras: {figure}")
+    return ()
 
 
 def _normalised(model: SparseModel, world: Similarity | None, outcome: SfmOutcome) -> Reconstruction:
@@ -253,14 +372,19 @@ def job_of(
         owners = [(frame.width, frame.height, lens) for frame, lens in zip(frames, lenses, strict=True)]
     else:
         owners = [frame.image for frame in frames]
+    known_focal = {}
+    if poses is None and config.focal is not None:
+        size = _input_size(frames[0])
+        known_focal = {kind: config.focal_share(kind, size) for kind in (FIRST_LENS, *get_args(SfmModel))}
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
     cameras: list[Intrinsics] = []
     exif_images: list[Path | None] = []
     for frame in (frames[owners.index(owner)] for owner in numbers):
         known = frame.camera if poses is not None else None
         model = FIRST_LENS if config.camera_model == "auto" else config.camera_model
-        cameras.append(known or guessed_camera(model, frame.width, frame.height))
-        stated = poses is None and frame.source.pts is None
+        share = known_focal.get(model, COLMAPS_GUESS)
+        cameras.append(known or guessed_camera(model, frame.width, frame.height, share))
+        stated = poses is None and frame.source.pts is None and config.focal is None
         exif_images.append(frame.source.path.resolve() if stated else None)
     matrices = {
         name: [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in read]
@@ -275,10 +399,20 @@ def job_of(
         camera_of=[numbers[owner] for owner in owners],
         poses=None if poses is None else matrices,
         exif_images=exif_images,
+        known_focal=known_focal,
+        focal_known=bool(known_focal),
         config=SfmConfig(**config.model_dump(include=set(SfmConfig.model_fields))),
         seed=seed,
         threads=threads,
     )
+
+
+def _input_size(frame: WorkFrame) -> int:
+    """Return the long side of the frame's image in the input, px."""
+    source = frame.source
+    if source.camera is not None:
+        return max(source.camera.width, source.camera.height)
+    return max(image_size(source.path) if source.pts is None else video_size(source.path))
 
 
 def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:
@@ -302,7 +436,8 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]
 def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
     """Return the model and the outcome of COLMAP's process. Raises InputError if one is damaged."""
     with faults_as(InputError, f"{OUTCOME} cannot be read", hint="run ingest again"):
-        return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
+        outcome = SfmOutcome.model_validate(read_json(folder / OUTCOME))
+        return read_model(folder).shifted(outcome.shifts_px), outcome
 
 
 def _within_reach(model: SparseModel) -> SparseModel:

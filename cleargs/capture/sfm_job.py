@@ -15,8 +15,20 @@ from cleargs.capture.config import SfmConfig
 OWN = "own"
 """Convention of an input's poses: the one of its layout."""
 
+NO_DEPTH = (
+    "the frames show no depth: the camera only turned or zoomed on one spot, or all that it shows is flat "
+    "(a homography explains the matches of distant frames)"
+)
+MOVE = "move, do not only turn: walk around the subject, sideways, with things at different distances in view"
+"""Cause and remedy if no frames differ by parallax (`cleargs.capture.parallax`)."""
+
 OUTCOME = "outcome.json"
 """File in the folder of a model, with its `SfmOutcome`."""
+
+
+GOOD_SHARE, LEAST_SHARE, MIN_KEYPOINTS = 0.5, 0.25, 100
+"""Shares of the kept-out keypoints within 2 px below which ingest is done only in part, and fails; fewest
+keypoints that count."""
 
 
 class Job(FrozenModel):
@@ -33,9 +45,22 @@ class Job(FrozenModel):
     """Convention that the input may mean -> matrices 3x4, world to camera, of all images."""
     exif_images: list[Path | None]
     """Input image of each camera that may state its focal length."""
+    known_focal: Mapping[str, float] = Field(default_factory=dict)
+    """Kind of lens -> focal length that the user states, in long sides."""
+    focal_known: bool = False
+    """True if the focal lengths of the cameras are stated by the user, or searched."""
     config: SfmConfig
     seed: int
     threads: int
+
+
+class Prediction(FrozenModel):
+    """Figure of the errors of cameras at keypoints of tracks that took no part in their fit."""
+
+    keypoints: int
+    share: float
+    """Share within `cleargs.capture.prediction.WITHIN_PX`."""
+    median_px: float
 
 
 class SfmOutcome(FrozenModel):
@@ -51,7 +76,13 @@ class SfmOutcome(FrozenModel):
     """Origin of the poses: the input's, the input's after adjustment, or structure from motion."""
     errors_px: Mapping[str, float] = Field(default_factory=dict)
     """Method -> median distance of the kept-out matches from their epipolar lines, px."""
+    prediction: Prediction | None = None
+    """Figure of all frames; None: not measured, or there are none."""
+    predictions: Mapping[str, Prediction] = Field(default_factory=dict)
+    """The same by working image."""
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
+    shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)
+    """Working image -> shift of its picture by a stabiliser, px; empty: none was found."""
     torn_at: int | None = None
     """Number of the first frame after a join that matches contradict (`weakest_join`); None: no such join."""

@@ -14,26 +14,47 @@ from __future__ import annotations
 import copy
 import filecmp
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from cleargs.capture.adjustment import FIRST_LENS, SHARED_BY, Adjuster, align_to, lens_of, median_residual
+from cleargs.capture.adjustment import (
+    FIRST_LENS,
+    SHARED_BY,
+    Adjuster,
+    adjust_all,
+    align_to,
+    lens_of,
+    median_residual,
+)
 from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import (
     colmap_cameras,
+    copy_features,
     copy_without_features,
     create_database,
     set_cameras,
     why_missing,
 )
-from cleargs.capture.kept_out import epipolar_errors, fitting_shares, verified_matches, weakest_join
+from cleargs.capture.kept_out import (
+    all_tracks,
+    epipolar_errors,
+    fitting_shares,
+    verified_matches,
+    weakest_join,
+)
+from cleargs.capture.lenses import FISHEYE, FISHEYE_AHEAD, GAIN, Fit, fitted, searched
+from cleargs.capture.parallax import shows_depth
+from cleargs.capture.prediction import scales_differ
 from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
-from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import MOVE, NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.steady import steadied
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
@@ -78,7 +99,7 @@ class Sfm(Features):
 
     def __init__(self, job: Job, report: Callable[..., None]) -> None:
         super().__init__(job, report)
-        self._matched = self.database
+        self.used_database = self.database
         """The database with the features by which frames were placed."""
         self._torn_at: int | None = None
         self.output = job.folder / "model.partial"
@@ -112,17 +133,112 @@ class Sfm(Features):
         if job.poses is not None:
             model, outcome = self._from_poses(job.poses, pairs)
         else:
-            model, placed = self.mapped(pairs)
-            if job.config.camera_model == "auto":
-                self._report(phase="measuring the lens", total=None)
-                model = Adjuster(self._matched, self.with_points).with_measured_lens(model)
-            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model), torn_at=self._torn_at)
+            model, outcome = self._from_images(pairs)
         make_folder(self.output, empty=True)
         model.write_binary(self.output)
         write_json(self.output / OUTCOME, outcome.model_dump())
         sync_tree(self.output)
         self.output.rename(job.folder / "model")
         sync(job.folder)
+
+    def _from_images(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, SfmOutcome]:
+        """Return the model of the images alone, with the lens that predicts the kept-out tracks best.
+
+        Another kind of lens, with a focal length that is searched, is tried if these tracks contradict the
+        cameras, or if no lens has such a focal length.
+        """
+        if not shows_depth(self.database):
+            raise StageError(NO_DEPTH, hint=MOVE)
+        tried = self
+        if self.job.config.camera_model == FISHEYE:
+            _, share, _ = self._searched(FISHEYE)
+            tried = self._with_lens(FISHEYE, share)
+        fit: Fit | None = None
+        placed: dict[str, str] = {}
+        failed: StageError | None = None
+        try:
+            model, placed = tried.mapped(pairs)
+            self._report(phase="measuring the lens", total=None)
+            fit = fitted(tried, model)
+        except StageError as error:
+            failed = error
+        if self.job.config.camera_model == "auto":
+            kind, share, ahead = self._searched(FISHEYE, "SIMPLE_PINHOLE")
+            if fit is None or fit.doubtful or (kind == FISHEYE and ahead >= FISHEYE_AHEAD):
+                self._report(phase="trying another lens", total=None)
+                other = self._with_lens(kind, share)
+                try:
+                    model, others = other.mapped(pairs)
+                    again = fitted(other, model, None if fit is None else fit.adjuster)
+                    whole = fit is None or model.num_reg_images() >= fit.model.num_reg_images()
+                    if fit is None or (
+                        whole and fit.error_of(again.judged) <= GAIN * fit.error_of(fit.judged)
+                    ):
+                        tried, fit, placed = other, again, others
+                except StageError as error:
+                    failed = failed or error
+        if fit is None:
+            assert failed is not None
+            raise failed
+        model, shifts = steadied(fit.model, adjust_all)
+        # The kept-out tracks have no shift, so they say nothing about the cameras of a stabilised video.
+        figure, figures = (None, {}) if shifts else fit.predictions()
+        outcome = SfmOutcome(
+            placed=placed,
+            method="sfm",
+            lens=lens_of(model),
+            torn_at=None if shifts else tried._torn_at,
+            shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
+            prediction=figure,
+            predictions=figures,
+        )
+        return model, outcome
+
+    def _searched(self, *kinds: str) -> tuple[str, float, float]:
+        """Return the kind of lens that most matches fit, its focal length in long sides, and by how much.
+
+        The last is the ratio of the fitting matches to those of the next kind. A stated focal length is kept.
+        """
+        cameras = colmap_cameras(self.job)
+        camera = cameras[Counter(self.job.camera_of).most_common(1)[0][0]]
+        known = self.job.known_focal
+        found = {kind: searched(self.database, kind, camera, known.get(kind)) for kind in kinds}
+        first, *others = sorted(kinds, key=lambda kind: -found[kind][1])
+        ahead = found[first][1] / max([1, *(found[kind][1] for kind in others)])
+        return first, found[first][0], ahead
+
+    def _with_lens(self, kind: str, share: float) -> Sfm:
+        """Return the steps with this kind of lens, and this focal length in long sides."""
+        job = self.job
+        model = kind if kind == FISHEYE else FIRST_LENS
+        other = self.variant(
+            "another-lens",
+            cameras=[guessed_camera(model, c.width, c.height, share) for c in job.cameras],
+            exif_images=[None] * len(job.cameras),
+            focal_known=True,
+            known_focal={},
+        )
+        pycolmap.set_random_seed(job.seed)
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = job.seed
+        with pycolmap.Database.open(other.database) as opened:
+            opened.clear_two_view_geometries()
+        pycolmap.geometric_verification(
+            other.database,
+            pycolmap.GeometricVerifierOptions(num_threads=1),
+            two_view_geometry_options=options,
+        )
+        return other
+
+    def variant(self, name: str, **changes: Any) -> Sfm:
+        """Return the steps of a changed job, in the folder ``name``, with the same features and matches."""
+        folder = self.job.folder / name
+        make_folder(folder, empty=True)
+        other = Sfm(self.job.model_copy(update={"folder": folder, **changes}), self._report)
+        make_folder(other.output, empty=True)
+        create_database(other.database, other.job)
+        copy_features(self.used_database, other.database)
+        return other
 
     def _from_poses(
         self, given: Mapping[str, list[list[list[float]]]], pairs: Sequence[tuple[int, int]]
@@ -132,9 +248,11 @@ class Sfm(Features):
         start = self.triangulate(given[convention])
         missed = median_residual(start)
         outcome = SfmOutcome(missed_px=missed, convention=convention)
+        adjuster = Adjuster(self.database, self.with_points)
+        figure, figures = Fit(start, adjuster, start).predictions()
+        outcome = outcome.model_copy(update={"prediction": figure, "predictions": figures})
         if missed <= self.job.config.refine_above and len(start.points3D):
             return start, outcome
-        adjuster = Adjuster(self.database, self.with_points)
         models = {"given": start}
         self._report(phase="adjusting poses and cameras", total=None)
         shared = len(self.job.names) >= SHARED_BY * len(self.job.cameras)
@@ -152,8 +270,10 @@ class Sfm(Features):
         share = _CONVINCING if errors[best] <= _EXPLAINED * adjuster.floor else _UNEXPLAINED
         if not 0 < errors[best] <= share * errors["given"]:
             return start, outcome.model_copy(update={"errors_px": errors})
-        model = self.with_points(models[best], self._matched if best == "sfm" else self.database)
-        update = {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
+        figure, figures = Fit(models[best], adjuster, models[best]).predictions()
+        model = self.with_points(models[best], self.used_database if best == "sfm" else self.database)
+        update: dict[str, Any] = {"prediction": figure, "predictions": figures}
+        update |= {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
         return model, outcome.model_copy(update={"errors_px": errors, **update})
 
     def _convention(self, given: Mapping[str, list[list[list[float]]]]) -> str:
@@ -190,9 +310,9 @@ class Sfm(Features):
         if model.num_reg_images() < len(job.names):
             return None, {}
         # Frames that were placed again have other features. The same tracks of all others are kept out.
-        if self._matched != self.database:
-            adjuster = Adjuster(self._matched, self.with_points)
-        model = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
+        if self.used_database != self.database:
+            adjuster = Adjuster(self.used_database, self.with_points)
+        model, _ = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
         align_to(model, given, model.images.values())
         return model, placed
 
@@ -201,7 +321,7 @@ class Sfm(Features):
         model = self._rejoined(self._corrected(self._map(), self.database), self.database)
         model, placed = self._place_the_rest(model, pairs)
         before = _names_in(model)
-        model = self._corrected(self._rejoined(model, self._matched), self._matched)
+        model = self._corrected(self._rejoined(model, self.used_database), self.used_database)
         return model, placed | dict.fromkeys(before - _names_in(model), "too few of its matches fit its pose")
 
     def _corrected(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
@@ -247,7 +367,8 @@ class Sfm(Features):
             if better <= share or not _names_in(found) >= _names_in(model):
                 break
             model, image, share = found, again, better
-        self._torn_at = image - 1 if share < _JOINED else None
+        torn = share < _JOINED and scales_differ(all_tracks(database), model, image)
+        self._torn_at = image - 1 if torn else None
         return model
 
     def _map(self) -> pycolmap.Reconstruction:
@@ -293,7 +414,7 @@ class Sfm(Features):
         model, and for each image how it was placed or why it was not.
         """
         names, reach = self.job.names, self.job.config.overlap
-        self._matched = self.database
+        self.used_database = self.database
         placed = dict.fromkeys(_names_in(model), FIRST.name)
         reasons: dict[str, str] = {}
         for settings in AGAIN:
@@ -304,13 +425,13 @@ class Sfm(Features):
             if settings.neighbours:
                 again = {i for i in range(len(names)) if any(abs(i - j) <= reach for j in missing)}
             database = self.database.with_name(f"{settings.name.replace(' ', '-')}.db")
-            copy_without_features(self._matched, database, [index + 1 for index in again])
+            copy_without_features(self.used_database, database, [index + 1 for index in again])
             self.extract(database, [names[index] for index in sorted(again)], settings)
             self.match(database, [pair for pair in pairs if not again.isdisjoint(pair)], " again")
             self._report(phase="placing frames again", total=None)
             found = self._continued(model, database, again, settings)
             if _names_in(found) > placed.keys():
-                model, self._matched = found, database
+                model, self.used_database = found, database
                 placed = dict.fromkeys(_names_in(model), settings.name) | placed
             reasons = why_missing(
                 database, {i + 1: name for i, name in enumerate(names) if name not in placed}

@@ -55,6 +55,15 @@ class Frame:
     placed: Annotated[str | None, "method by which the pose was found, or the reason why there is none"]
     mask: str | None
     """Path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None. Not in the table."""
+    kept_out_keypoints: Annotated[
+        int | None, "keypoints of tracks that took no part in the fit of the cameras"
+    ] = None
+    kept_out_share: Annotated[float | None, "share of these within 2 px of their places by the cameras"] = (
+        None
+    )
+    kept_out_px: Annotated[
+        float | None, "median distance of these from their places, px of the working image"
+    ] = None
 
     @property
     def pose(self) -> Pose:

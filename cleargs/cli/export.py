@@ -23,6 +23,7 @@ Examples:
   cleargs export room --for web -o site/room.spz   y is up; for Spark and three.js
   cleargs export room -o room.ply -o room.sog      two formats in one call
   cleargs export room -o room.ply --metres 0-40=3.5   frames 0 and 40 were filmed 3.5 m apart
+  cleargs export room --for blender --upright 0:left   the camera was held sideways
   cleargs export room -o room.ply --world input    in the world of the capture's poses
   cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
   cleargs export room -o room.ply --drop sphere:0.2,-1,3,0.1   without a floater
@@ -63,6 +64,12 @@ Programs of --for:
     help="Turn the scene so that this axis points up (write --up=-y with =). The camera of the "
     "first frame is then at the origin and looks ahead. "
     "Use y for Spark and three.js, z for Blender.  [default: the axes of SuperSplat]",
+)
+@click.option(
+    "--upright",
+    metavar="FRAME:SIDE|X,Y,Z",
+    help="Turn the scene so that a side (top, left, right, bottom) of the picture of a frame points up, or a "
+    "direction in the coordinates of cameras.json. For scenes that lie on their side.",
 )
 @click.option(
     "--prune",

@@ -13,6 +13,7 @@ import click
 from click.core import ParameterSource
 
 import cleargs
+from cleargs.capture.sfm_job import GOOD_SHARE
 from cleargs.capture.sources import whole_capture
 from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
@@ -337,12 +338,22 @@ def outcome_lines(outcomes: Sequence[StageOutcome], run: Path, report: Path | No
     return [line for line in lines if not line.endswith(": ")]
 
 
+def _trust(kept_out: Mapping[str, Any] | None) -> str:
+    """Return if frames count as placed, with the figure of the keypoints that took no part in their fit."""
+    if kept_out is None:
+        return "placed"
+    figure = (
+        f"{kept_out['share']:.0%} of kept-out keypoints within 2 px, median {kept_out['median_px']:.2g} px"
+    )
+    return f"{'placed' if kept_out['share'] >= GOOD_SHARE else 'with doubtful cameras'}: {figure}"
+
+
 def _extent(summaries: Summaries) -> str:
     """Return the numbers of placed, reliable and repaired frames, as far as they are known."""
     ingest, consolidate = summaries.get("ingest", {}), summaries.get("consolidate", {})
     words = []
     if "registered" in ingest and "frames" in ingest:
-        words.append(f"{ingest['registered']} of {ingest['frames']} frames placed")
+        words.append(f"{ingest['registered']} of {ingest['frames']} frames {_trust(ingest.get('kept_out'))}")
     if "roles" in summaries.get("rva", {}):
         words.append(f"{summaries['rva']['roles']['strong']} reliable")
     if consolidate.get("repairs"):

@@ -48,7 +48,12 @@ LABELS: Mapping[str, str] = {
     "given_poses_missed_px": "median reprojection error at the given poses, px",
     "pose_convention": "convention of the given poses",
     "kept_out_matches_off_px": "median error of matches that the fit did not use, by origin of the poses, px",
+    "kept_out": "keypoints that no fit used",
+    "keypoints": "keypoints",
+    "share": "share within 2 px",
+    "median_px": "median distance, px",
     "focal_px": "focal length, px",
+    "focal_range_px": "shortest and longest focal length, px",
     "stand_in": "stand-ins for reliable frames",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
@@ -326,6 +331,9 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any])
     if frame.registered:
         centre = ", ".join(f"{value:.3f}" for value in facts["centre"])
         yield "pose", f"camera at ({centre}), sees {frame.n_points} sparse points"
+        if frame.kept_out_share is not None:
+            figure = f"{frame.kept_out_share:.0%} within 2 px, median {frame.kept_out_px:.2f} px"
+            yield "kept out", f"{frame.kept_out_keypoints} keypoints that no fit used: {figure}"
     else:
         yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
     if rated:

@@ -18,6 +18,12 @@ def _protocols() -> Iterable[str]:
     return PROTOCOLS
 
 
+def _lenses() -> Iterable[str]:
+    from cleargs.synth.optics import LENSES
+
+    return LENSES
+
+
 @click.command(
     epilog="""\b
 Example:
@@ -56,6 +62,13 @@ Protocols, with mean lengths at a width of 640 px:
     "--video",
     is_flag=True,
     help="Also write OUT/capture.mp4: 30 frames per second, with every fifth in OUT/images.",
+)
+@click.option(
+    "--lens",
+    default="phone",
+    show_default=True,
+    shell_complete=completed(_lenses),
+    help="phone, zoom (1 to 1.8), switch (to 1.8x halfway), breathing (by 1.5 %), or fisheye (122 degrees).",
 )
 @json_option
 def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> None:

@@ -168,7 +168,7 @@ def _renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None, exposure
             shown = alpha > 0.5
             distance = float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
             camera, refinement = refine_pose(
-                lambda camera: render(camera)[0], camera, distance, target, mask, refine_steps
+                lambda camera: render(camera)[int(view.cut_out)], camera, distance, target, mask, refine_steps
             )
         farthest = None if points is None else metrics.depth_of_points(points, camera)
         if farthest is not None:
@@ -274,7 +274,10 @@ def _evaluate(
     ):
         for view in reference.views:
             target, mask = view.load()
-            waiting.append(pool.submit(measured, view.name, predict(view, target, mask), target, mask))
+            prediction = predict(view, target, mask)
+            if view.cut_out and prediction.over_white is not None:
+                prediction = replace(prediction, image=prediction.over_white)
+            waiting.append(pool.submit(measured, view.name, prediction, target, mask))
             if len(waiting) > 2 * threads:  # so that memory does not grow with the number of images
                 images.append(waiting.popleft().result())
                 task.advance()

@@ -15,9 +15,10 @@ import numpy as np
 from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.capture.capture import SourceFrame
+from cleargs.capture.cutouts import are_cut_outs, over_white
 from cleargs.capture.folders import chosen, name_below_images, natural_key
 from cleargs.capture.layouts.transforms import read_transforms
-from cleargs.capture.prepare import read_image, read_stencil
+from cleargs.capture.prepare import is_as_stored, read_image, read_stencil
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
@@ -25,14 +26,16 @@ from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
-from cleargs.formation.frames import view_of
+from cleargs.formation.frames import has_alpha, view_of
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
+from cleargs.media.image import read_transparency
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.packed import require_images
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
+from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64, ImageU8, MaskBool
 
 T = TypeVar("T")
@@ -42,6 +45,10 @@ LARGE_RESIDUAL = 0.02
 
 MAX_RESIDUAL = 0.05
 """Residual above which there is an error: each view would be rendered far from its reference."""
+
+MAX_OUTSIDE, MIN_SPREAD = 3.0, 0.01
+"""Distance of the references, in reaches of the scene, and spread of them, in that of the frames, from which
+the units of both differ."""
 
 SAME_VIEW = 0.05
 """Two views are the same if their centres are closer than this (the farthest camera is 1 from the mean), and
@@ -67,6 +74,8 @@ class ReferenceView:
     """Length of a unit of the scene, in the units of ``depth``."""
     path: MeasuredPath | None = None
     """Measured motion of the camera; None if none is known."""
+    cut_out: bool = False
+    """True if the image is a cut-out over white: renders are compared over white, empty pixels count."""
 
     @property
     def pose(self) -> Pose:
@@ -142,6 +151,8 @@ def reference_of(
                 _report_fit(alignment, align or directory, reporter)
             else:
                 similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
+                theirs = [similarity.pose(view.pose) for view in listed.values()]
+                _require_one_unit(theirs, [*own.values()], _points(ingest))
             views = [
                 replace(view.at(similarity.pose(view.pose)), unit=similarity.scale)
                 for view in listed.values()
@@ -188,6 +199,39 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         reporter.warn(f"{text}: large; {hint}")
     else:
         reporter.info(text)
+
+
+def _points(ingest: Path) -> ArrayF64:  # [P, 3]
+    """Return the sparse points of a run; none if it lacks their table."""
+    try:
+        return load_points(ingest).xyz
+    except StoreError:
+        return np.zeros((0, 3))
+
+
+def _require_one_unit(theirs: Sequence[Pose], ours: Sequence[Pose], points: ArrayF64) -> None:
+    """Raise InputError if the references are far outside the scene, or all at one place of it.
+
+    ``points`` [P, 3] are the scene's, in the world of both.
+    """
+    if not ours:
+        return
+    away, own = (np.stack([pose.centre for pose in poses]) for poses in (theirs, ours))
+    middle = own.mean(axis=0)
+    scene = np.concatenate([own, points])
+    reach = float(np.quantile(np.linalg.norm(scene - middle, axis=1), 0.99))
+    distance = float(np.median(np.linalg.norm(away - middle, axis=1)))
+    spreads = [float(np.linalg.norm(centres.std(axis=0))) for centres in (away, own)]
+    fault = ""
+    if distance > MAX_OUTSIDE * reach:
+        times = distance / max(reach, 1e-12)
+        fault = f"the references are {times:.3g} times as far away as the scene reaches"
+    elif len(away) >= 3 and spreads[0] < spreads[1] * MIN_SPREAD:
+        times = spreads[1] / max(spreads[0], 1e-12)
+        fault = f"the references are {times:.3g} times as close together as the frames"
+    if fault:
+        hint = "give their poses in the world and the units of the run's input (metres against millimetres?)"
+        raise InputError(fault, hint=hint)
 
 
 def align_cameras(source: Sequence[Pose], target: Sequence[Pose]) -> tuple[Similarity, Alignment]:
@@ -260,8 +304,9 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
         if stems[stem] > 1:  # for example the cameras of a rig, in separate folders
             stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
-        path = measured.get(frame.frame_id)
-        views.append(ReferenceView(stem, view.camera, view.load, path=path))
+        path, cut_out = measured.get(frame.frame_id), has_alpha(ingest / frame.image)
+        load = partial(_cut_out, view) if cut_out else view.load
+        views.append(ReferenceView(stem, view.camera, load, path=path, cut_out=cut_out))
     return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 
@@ -304,8 +349,9 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
     names = [name_below_images(entry.name) for entry in entries]
     way_of = cache(partial(undistorter, max_size=sys.maxsize))
-    views = []
-    for entry in chosen(entries, directory / "images", len(entries), names):
+    views, found = [], chosen(entries, directory / "images", len(entries), names)
+    cut_out = are_cut_outs([entry.path for entry in found])
+    for entry in found:
         lens, pose = entry.camera, entry.pose
         assert lens is not None and pose is not None  # asked for with poses=True
         way = way_of(lens)
@@ -314,13 +360,27 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
         stem = stem_of(entry.name)
         depth = directory / "depth" / f"{stem}.exr"
         known = depth if lens.is_pinhole and depth.is_file() else None
-        view = ReferenceView(stem, camera, partial(_load, entry, lens, way), known)
+        load = partial(_load, entry, lens, way, cut_out)
+        view = ReferenceView(stem, camera, load, known, cut_out=cut_out)
         views.append((stem, view.at(pose)))
     return _by_stem(views)
 
 
-def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, MaskBool | None]:
-    image, stencil = read_image(frame), read_stencil(frame)
+def _cut_out(view: TrainingView) -> tuple[ImageU8, MaskBool | None]:
+    """Return a cut-out of a run over white, and its mask, in which empty pixels count."""
+    image, mask = view.load()
+    alpha = None if view.transparency is None else view.transparency()
+    assert alpha is not None and image.dtype == np.uint8
+    return over_white(image, alpha), None if mask is None else mask | (alpha <= 127)
+
+
+def _load(frame: SourceFrame, lens: Lens, way: Undistorter, cut_out: bool) -> tuple[ImageU8, MaskBool | None]:
+    image = read_image(frame)
+    stencil = None if cut_out and frame.mask is None else read_stencil(frame)
+    if cut_out:
+        alpha = read_transparency(frame.path, upright=not is_as_stored(frame))
+        assert alpha is not None  # `are_cut_outs`
+        image = over_white(image, alpha)
     if image.shape[1::-1] != (lens.width, lens.height):
         raise InputError(
             f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels, "

@@ -45,14 +45,14 @@ class Exposure:
 
     @classmethod
     def from_gains(cls, frame_ids: Sequence[int], gains: NDArray[np.float64]) -> Exposure:
-        """Return the exposure that brightens each frame by its gain over the median gain.
+        """Return the exposure that multiplies each channel of a frame by its gain over the median gain.
 
-        ``frame_ids`` must be distinct. A frame whose gain [F] is NaN is not changed.
+        ``frame_ids`` must be distinct. A frame whose gains [F, 3] are NaN is not changed.
         """
-        known = gains[np.isfinite(gains)]
-        relative = gains / np.median(known) if len(known) else gains
+        known = gains[np.isfinite(gains).all(axis=1)]
+        relative = gains / np.median(known, axis=0) if len(known) else gains
         order = np.argsort(np.asarray(frame_ids))
-        start = np.where(np.isfinite(relative), relative, 1.0)[order, None, None] * IDENTITY
+        start = np.where(np.isfinite(relative), relative, 1.0)[order, :, None] * IDENTITY
         return cls(np.asarray(frame_ids, np.int32)[order], start)
 
     @property
@@ -81,12 +81,12 @@ def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArr
 
 
 def frame_gains(views: Sequence[TrainingView], sparse: SparsePoints) -> NDArray[np.float64]:
-    """Return the gain of each view, its brightness over the average: [V], NaN where unknown.
+    """Return the gain of each sRGB channel of each view, its level over the average: [V, 3], NaN: unknown.
 
     The gain is the median of a ratio over the sparse points that the view observes: the pixel at the
-    projection of the point over the colour of the point (both as sums of the sRGB channels).
+    projection of the point over the colour of the point.
     """
-    gains = np.full(len(views), np.nan)
+    gains = np.full((len(views), 3), np.nan)
     for index, (view, seen) in enumerate(zip(views, sparse.observed, strict=True)):
         camera = view.camera
         pose = camera.world_to_camera
@@ -98,20 +98,28 @@ def frame_gains(views: Sequence[TrainingView], sparse: SparsePoints) -> NDArray[
         image, mask = view.load()
         rows, columns = row[inside].astype(np.int64), column[inside].astype(np.int64)
         white = 1.0 if image.dtype == np.uint8 else 255.0
-        shown = image[rows, columns].astype(np.float64).sum(axis=1) * white
-        mean = sparse.rgb[seen][inside].astype(np.float64).sum(axis=1)
-        usable = (mean > 30.0) & (mean < 735.0)  # near black and white a ratio says nothing about exposure
+        shown = image[rows, columns].astype(np.float64) * white
+        mean = sparse.rgb[seen][inside].astype(np.float64)
+        # Near black and white a ratio says nothing about exposure.
+        usable = ((mean > 10.0) & (mean < 245.0)).all(axis=1)
         if mask is not None:
             usable &= mask[rows, columns]
         if usable.sum() >= MIN_POINTS:
-            gains[index] = np.median(shown[usable] / mean[usable])
+            gains[index] = np.median(shown[usable] / mean[usable], axis=0)
     return gains
 
 
-def gain_spread(gains: NDArray[np.float64]) -> float:
-    """Return the standard deviation of the known log gains (0.05: about 5 %); 0 with fewer than two."""
-    known = np.log(np.maximum(gains[np.isfinite(gains)], 1e-3))
-    return float(known.std()) if len(known) > 1 else 0.0
+def gain_spread(gains: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the standard deviations of the known log ``gains`` [F, 3] (0.05: about 5 %).
+
+    The first is that of the brightness (their mean over the channels), the second the largest of the channels
+    without the brightness: a change of white balance. Both are 0 with fewer than two frames.
+    """
+    known = np.log(np.maximum(gains[np.isfinite(gains).all(axis=1)], 1e-3))
+    if len(known) < 2:
+        return 0.0, 0.0
+    brightness = known.mean(axis=1, keepdims=True)
+    return float(brightness.std()), float((known - brightness).std(axis=0).max())
 
 
 def write_exposure(path: Path, exposure: Exposure) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -14,8 +15,10 @@ from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
 from cleargs.splat.initialise import SparsePoints
 from cleargs.splat.views import TrainingView
-from cleargs.types import AnyImage, MaskBool
+from cleargs.types import AnyImage, MaskBool, MaskU8
 
+_RGBA = b"\x06"
+"""Type of colour in the header of a PNG with alpha (byte 25)."""
 GIVEN = "given"
 """Value of ``placed`` in ``ingest/frames.parquet`` for a pose that is unchanged from the input: features miss
 their points by at most ``ingest.refine_above`` px (median). Ingest adjusts or estimates all other poses."""
@@ -34,7 +37,8 @@ def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
     image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
     estimated = frame.placed not in (None, GIVEN)
     time = float(frame.frame_id) if frame.time_s is None else frame.time_s
-    return TrainingView(frame.frame_id, camera, weight, "real", partial(_load, image, mask), estimated, time)
+    load, transparency = partial(_load, image, mask), partial(_alpha, image)
+    return TrainingView(frame.frame_id, camera, weight, "real", load, estimated, time, transparency)
 
 
 def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[TrainingView]:
@@ -58,6 +62,19 @@ def seen_points(points: Points, ingest: Path, views: Sequence[TrainingView]) -> 
     order = np.argsort(points.point_id)
     rows = order[np.searchsorted(points.point_id, point_id, sorter=order)]
     return SparsePoints(points.xyz, points.rgb, [rows[frame_id == view.frame_id] for view in views])
+
+
+def has_alpha(image: Path) -> bool:
+    """Return True if a PNG that ingest wrote has an alpha: it is a cut-out."""
+    with suppress(OSError), image.open("rb") as file:
+        return file.read(26)[25:] == _RGBA
+    return False
+
+
+def _alpha(image: Path) -> MaskU8 | None:
+    """Return the alpha [H, W] of a PNG that ingest wrote; None if it has none."""
+    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED) if has_alpha(image) else None
+    return None if pixels is None else np.ascontiguousarray(pixels[..., 3])
 
 
 def _load(image: Path, mask: Path | None) -> tuple[AnyImage, MaskBool | None]:

@@ -54,6 +54,10 @@ EXPOSURES = np.geomspace(1 / 16, 3.0, 18)
 NEARER = np.array([0.85, 0.92, 1.0, 1.08, 1.17])
 """Exposure times that are tried around the best of these, as factors."""
 
+SHORTEST = 1.0
+"""Shortest mean blur of a measured motion, px of the full image. A blur of less than a pixel looks like the
+softness of the render: sharp frames of rooms found 0.2 to 0.8 px, and the scene became too sharp."""
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -152,7 +156,7 @@ class _Look:
         """Return the fit without blur and defocus, then those of the known or of the measured motion."""
         frame, terms, held = self._frame, self._terms, self._held
         if terms.measured is not None and not frame.searched:
-            return [self._resting(), *self._measured(terms.measured)]
+            return [self._resting(), *filter(self._visible, self._measured(terms.measured))]
         if held is None:
             return refine(self._pair, frame.model, self._known, pose=terms.pose, curve=terms.curve)
         model: Model = "defocus" if frame.model == "defocus" else "blur"
@@ -187,6 +191,10 @@ class _Look:
         """Return fits of the measured motion during the exposure of ``times`` that explains most."""
         fits = measured_fits(self._pair, [self._exposed(measured, float(time)) for time in times])
         return [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.misfit).motion)]
+
+    def _visible(self, fit: MotionFit) -> bool:
+        """Return True if the mean blur of ``fit`` is not shorter than `SHORTEST`."""
+        return _blur_of(fit.motion, self._pair, self._rendered) >= SHORTEST * self._shot.factor
 
     def _exposed(self, measured: MeasuredPath, seconds: float) -> FrameMotion:
         return measured.exposed(seconds, self._shot.camera, finest_level(self._pair).median)
@@ -276,6 +284,13 @@ class _Look:
         """Return the frame with its new fit and the evidence of further blur."""
         frame, shot = replace(self._frame, evidence=evidence), self._shot
         return _described(frame, best, shot.factor, shot.camera, self._rendered, self._margin)
+
+
+def _blur_of(motion: FrameMotion, pair: FramePair, rendered: Render) -> float:
+    """Return the mean length of the pixels' paths during the exposure, px of ``pair``."""
+    assert rendered.depth is not None
+    fields = displacement_fields(motion, pair.camera, rendered.depth, rendered.alpha, pair.margin)
+    return float(path_lengths(fields, 4).mean(dtype=np.float64))
 
 
 def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvidence:

@@ -142,18 +142,33 @@ def read_mask(path: Path, turn: int = 1) -> MaskU8:  # [H, W]
     return np.asarray(np.where(grey > border, 255, 0), np.uint8)
 
 
+def read_grey(path: Path) -> MaskU8:  # [H, W]
+    """Return the levels of a one-channel image. Raises InputError if it cannot be read."""
+    with _decoded(path) as image:
+        return np.array(image.convert("L"))
+
+
 def read_alpha(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
     """Return the transparency of an image as a mask: 0 if it is more than half transparent, else 255.
 
     None if it is opaque everywhere. ``upright`` and errors are as in `read_rgb`.
+    """
+    alpha = read_transparency(path, upright=upright)
+    return None if alpha is None else np.asarray(np.where(alpha > 127, 255, 0), np.uint8)
+
+
+def read_transparency(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
+    """Return the alpha of an image, 0 (transparent) to 255; None if no pixel is more than half transparent.
+
+    ``upright`` and errors are as in `read_rgb`.
     """
     if path.suffix.lower() in _OPAQUE:
         return None
     with _decoded(path, upright=upright) as image:
         if not image.has_transparency_data:
             return None
-        opaque = np.asarray(image.convert("RGBA"))[..., 3] > 127
-    return None if opaque.all() else np.asarray(np.where(opaque, 255, 0), np.uint8)
+        alpha = np.asarray(image.convert("RGBA"))[..., 3]
+    return None if (alpha > 127).all() else alpha
 
 
 def write_rgb(path: Path, image: AnyImage, *, quality: int | None = None) -> None:

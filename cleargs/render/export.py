@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Similarity
+from cleargs.capture.cameras import Similarity, upright
 from cleargs.capture.model import read_model, transform_model, write_model
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.digest import named_files
@@ -41,6 +42,8 @@ class ExportOptions:
     """Choices of `export_scene`; see ``cleargs export --help``."""
 
     up: str | None = None
+    upright: str | None = None
+    """``FRAME:SIDE`` or ``X,Y,Z``: the side of a picture, or the direction in the run's world, that is up."""
     world: Literal["normalised", "input"] = "normalised"
     metres: str | None = None
     """``A-B=D``: the cameras of frames A and B are D metres apart."""
@@ -66,8 +69,8 @@ def export_scene(
     Raises InputError if an option cannot be used, or if a file exists and is not to be replaced.
     """
     kinds = _kinds(outputs, options)
-    if options.up is not None and options.world == "input":
-        raise InputError("--up and --world input exclude each other", hint="give one of them")
+    if (options.up or options.upright) is not None and options.world == "input":
+        raise InputError("--up and --upright exclude --world input", hint="give one of them")
     thresholds = parse_prune(options.prune)
     check_outputs(outputs, installed(), run, force=options.force)
     ingest = run / "ingest"
@@ -119,11 +122,35 @@ def export_file(file: Path, outputs: Sequence[Path], options: ExportOptions) -> 
     scene = read_scene(file)
     if options.sh_degree is not None:
         scene = padded(scene, options.sh_degree)
-    if options.up is not None:
-        scene = transform_scene(scene, scale=1.0, rotation=np.array(UP[options.up]), translation=np.zeros(3))
+    if (options.up or options.upright) is not None:
+        rotation = np.array(UP[options.up or "-y"])
+        if options.upright is not None:
+            rotation = rotation @ upright(_direction(options.upright, {}))
+        scene = transform_scene(scene, scale=1.0, rotation=rotation, translation=np.zeros(3))
     scene, cropped = _cropped(scene, options)
     written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {file.name}")
     return [*cropped, *written]
+
+
+_SIDES = {"top": (1, -1.0), "bottom": (1, 1.0), "left": (0, -1.0), "right": (0, 1.0)}
+"""Side of a picture -> axis of its camera, and sign."""
+
+
+def _direction(text: str, cameras: Mapping[int, tuple[str, Camera]]) -> NDArray[np.float64]:  # [3]
+    """Return the direction in the run's world that ``--upright`` gives. Raises InputError."""
+    side = re.fullmatch(r"(\d+):(top|bottom|left|right)", text)
+    if side is not None and int(side[1]) in cameras:
+        axis, sign = _SIDES[side[2]]
+        return np.asarray(sign * cameras[int(side[1])][1].world_to_camera[axis, :3])
+    with suppress(ValueError):
+        direction = np.array([float(number) for number in text.split(",")])
+        if direction.shape == (3,) and np.isfinite(direction).all() and np.linalg.norm(direction) > 1e-6:
+            return direction
+    frames = f"; frames with a pose are {min(cameras)} to {max(cameras)}" if cameras else ""
+    raise InputError(
+        f"--upright {text} cannot be used",
+        hint=f"give FRAME:top, left, right or bottom, or a direction X,Y,Z{frames}",
+    )
 
 
 def _kinds(outputs: Sequence[Path], options: ExportOptions) -> list[str]:
@@ -179,8 +206,16 @@ def _similarity(
         manifest = linked_manifest(ingest.parent, ingest.name)
         world = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
         similarity = {"scale": world.scale, "rotation": world.rotation.T, "translation": world.origin}
-    elif options.up is not None:
-        similarity = orient_up(next(iter(cameras.values()))[1], options.up)
+    else:
+        stand = np.eye(3) if options.upright is None else upright(_direction(options.upright, cameras))
+        if options.up is not None:
+            first = next(iter(cameras.values()))[1]
+            pose = first.world_to_camera.copy()
+            pose[:3, :3] = pose[:3, :3] @ stand.T
+            similarity = orient_up(replace(first, world_to_camera=pose), options.up)
+            similarity["rotation"] = similarity["rotation"] @ stand
+        elif options.upright is not None:
+            similarity = {"scale": 1.0, "rotation": stand, "translation": np.zeros(3)}
     if options.metres is not None:
         match = re.fullmatch(r"(\d+)-(\d+)=(\d*\.?\d+)", options.metres)
         pair = [int(match[n]) for n in (1, 2)] if match else []

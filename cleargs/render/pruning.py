@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
+from cleargs.formation.dust import contributions
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import real_views
 from cleargs.formation.observed import evaluate_views
@@ -24,9 +25,6 @@ from cleargs.parquet import read_table
 from cleargs.progress import Reporter
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.backend import mean_psnr, rasteriser_for
-from cleargs.splat.camera import Camera
-from cleargs.splat.constants import SH_C0
-from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import TrainingView
 
@@ -163,27 +161,6 @@ def crop_scene(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
     return replace(scene, gaussians=smaller), (
         f"cropped to the box {box}: {means.shape[0] - smaller.num} of {means.shape[0]} Gaussians are outside"
     )
-
-
-def contributions(scene: Scene, cameras: Iterable[Camera], advance: Callable[[], None]) -> Tensor:  # [N]
-    """Return the largest contribution of each Gaussian to one picture, in pixels.
-
-    The contribution is the sum over pixels of the blending weight (opacity times the transmittance in front).
-    A pixel's colour is the sum of weight times colour, so this is the gradient of the sum of the picture with
-    respect to the colour of the Gaussian. All colours are set to grey, because a colour that is clamped at 0
-    has no gradient. ``advance`` is called after each camera.
-    """
-    gaussians = scene.gaussians.detach()
-    grey = Gaussians(**{**gaussians.tensors(), "sh": torch.zeros_like(gaussians.sh[:, :1])})
-    engine = rasteriser_for(gaussians.device)
-    largest = torch.zeros(gaussians.num, device=gaussians.device)
-    for camera in cameras:
-        image = engine.forward(grey, camera, antialias=scene.antialias).image
-        red_gradient = torch.zeros_like(image)
-        red_gradient[..., 0] = 1.0 / SH_C0
-        torch.maximum(largest, engine.backward(red_gradient).sh[:, 0, 0], out=largest)
-        advance()
-    return largest
 
 
 def inside(means: Tensor, low: NDArray[np.float64], high: NDArray[np.float64]) -> Tensor:  # [N] bool

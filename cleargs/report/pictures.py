@@ -18,11 +18,11 @@ from cleargs.formation.frames import camera_of, view_of
 from cleargs.formation.motion import pixel_paths
 from cleargs.formation.movement import still_pixels
 from cleargs.media.exr import from_layer
-from cleargs.media.image import read_rgb, reduced, to_uint8
+from cleargs.media.image import read_mask, read_rgb, reduced, to_uint8
 from cleargs.report.frames import HELD_OUT, FrameRow
 from cleargs.rivr.distillation import TrainedScene
 from cleargs.splat.render import Viewer
-from cleargs.types import ImageU8
+from cleargs.types import ImageU8, MaskBool
 
 LAYERS = {
     "observed": "As filmed",
@@ -32,6 +32,7 @@ LAYERS = {
     "restored": "Restored",
     "fused": "Fused",
     "render": "Scene before repair",
+    "masked": "Not used: masked",
     "moving": "Not used: moves",
     "final": "Final scene",
 }
@@ -133,21 +134,28 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     Raises InputError if an image cannot be read, and StoreError for the file of the layers.
     """
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
+    observed = images["observed"]
+    if row.frame.mask and not (used := read_mask(run / "ingest" / row.frame.mask) > 0).all():
+        images["masked"] = _tinted(observed, used)
     if row.moving is not None:
-        height, width = images["observed"].shape[:2]
-        still = still_pixels(row.moving, height, width)[..., None]
-        tint = np.where(still, images["observed"], _UNUSED).astype(np.uint8)
-        images["moving"] = np.asarray(cv2.addWeighted(images["observed"], 0.4, tint, 0.6, 0.0), np.uint8)
+        images["moving"] = _tinted(observed, still_pixels(row.moving, *observed.shape[:2]))
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}
     return images
 
 
+def _tinted(image: ImageU8, used: MaskBool) -> ImageU8:
+    """Return an image [H, W, 3] whose pixels that are not ``used`` [H, W] are tinted."""
+    tint = np.where(used[..., None], image, _UNUSED).astype(np.uint8)
+    return np.asarray(cv2.addWeighted(image, 0.4, tint, 0.6, 0.0), np.uint8)
+
+
 def _expected_layers(row: FrameRow) -> int:
+    masked = int(row.frame.mask is not None)
     if row.selection is not None and row.selection.exr is not None:
-        return 6 if row.modelled else 5
-    return 4 if row.modelled else 1
+        return masked + (6 if row.modelled else 5)
+    return masked + (4 if row.modelled else 1)
 
 
 def _write_frame(

@@ -89,7 +89,9 @@ def cameras_of(manifests: Mapping[str, Manifest]) -> dict[str, Any]:
 
     ``method`` is "given", "adjusted", "sfm over given" (SfM, aligned to the given cameras) or "sfm".
     ``off_px_before`` and ``off_px`` are the median errors (px) of matches that the fit did not use, at the
-    given poses and at those of the method; None if not measured. ``lenses`` has lens, focal length and number
+    given poses and at those of the method; None if not measured. ``kept_out`` has the figure of all keypoints
+    that no fit used.
+    ``lenses`` has lens, focal length and number
     of frames of each camera. ``placed`` has the number of frames by the way in which they were placed.
     """
     if (ingest := manifests.get("ingest")) is None:
@@ -100,6 +102,7 @@ def cameras_of(manifests: Mapping[str, Manifest]) -> dict[str, Any]:
         "method": "sfm over given" if origin == "sfm" and errors else origin,
         "off_px_before": errors.get("given"),
         "off_px": errors.get(origin),
+        "kept_out": ingest.summary.get("kept_out"),
         "lenses": ingest.summary.get("cameras"),
         "placed": ingest.summary.get("placed"),
     }

@@ -19,6 +19,7 @@ from cleargs.capture.folders import spread
 from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.deblur import deblur
+from cleargs.formation.dust import without_dust
 from cleargs.formation.exposure import read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.look import Shot, Terms, fit_motion
@@ -273,12 +274,14 @@ class TrainedScene:
                 device=self._device,
             )
             result = trainer.run(checkpoint=folder / CHECKPOINT, reporter=reporter, label=label, round=round)
+            learned, moving = formation.exposure or self._written_exposure, formation.moving
+            result = without_dust(result, views, learned, formation.frames, moving, self._device).trained
             write_table(folder / LOG, result.rows, TRAIN)
             save_state(folder / STATE, result.state)
-            write_exposure(folder / EXPOSURE, formation.exposure or self._written_exposure)
+            write_exposure(folder / EXPOSURE, learned)
             weights = {view.frame_id: view.weight for view in views if view.kind == "real"}
             write_formation(folder / FORMATION, formation, weights)
-            write_movement(folder / MOVEMENT, formation.moving)
+            write_movement(folder / MOVEMENT, moving)
             write_ply(folder / SCENE, result.scene)  # last: it marks the training as done
         (folder / CHECKPOINT).unlink(missing_ok=True)
         return TrainedScene(folder, self._device, self._motions)

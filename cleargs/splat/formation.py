@@ -26,6 +26,8 @@ class Formed(Protocol):
     weight: float
     """Weight of the view: the original weight, or more if image formation explains the frame."""
 
+    affine: Tensor | None
+    """Colour affine [3, 4] of the frame; None: the colours stay."""
     mask: Tensor | None
     """Pixels [H, W] that count; None: all. After `forward`, those in which something moves are left out."""
 

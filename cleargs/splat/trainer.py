@@ -203,18 +203,25 @@ class Trainer:
         config, view, schedule_step = self._config, self._view(self.done), self._schedule_step
         factor = self._schedule.image_factor(schedule_step)
         target, mask = self._cache.get(view, factor)
+        alpha = self._cache.alpha
         colour = random_grey(self._seed, schedule_step) if config.background is None else None
         formed, looks = None, _Looks(partial(self._render, depth=True), colour, self._scene.background)
         if self._formation is not None:
             progress = schedule_step / config.planned
-            formed = self._formation.form(view, factor, progress, target, mask, looks.render)
+            opaque = mask if alpha is None else _both(mask, alpha > 0.5)
+            formed = self._formation.form(view, factor, progress, target, opaque, looks.render)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
         depth = formed is not None and formed.needs_depth
         render = looks.last_of(camera) or self._render(camera, depth=depth, background=colour)
         image = render.image if formed is None else formed.forward(render)
-        mask = mask if formed is None else formed.mask
+        if alpha is None:
+            mask = mask if formed is None else formed.mask
+        else:
+            affine = None if formed is None else formed.affine
+            target = _over(target, alpha, colour or self._scene.background, affine)
+            mask = mask if formed is None else _with_empty(formed.mask, mask, alpha)
         image, too_bright = recorded(image, target)
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         gradient = self._add_loss(image, target, mask, weight)
@@ -414,6 +421,26 @@ class _Looks:
     def last_of(self, camera: Camera) -> Render | None:
         """Return the last render, over the colour of the step, if its camera equals ``camera``; else None."""
         return self._last if self._last is not None and self._seen_by == _numbers(camera) else None
+
+
+def _both(mask: Tensor | None, other: Tensor) -> Tensor:
+    return other if mask is None else mask & other
+
+
+def _with_empty(opaque: Tensor | None, mask: Tensor | None, alpha: Tensor) -> Tensor | None:
+    """Return the pixels [H, W] of ``opaque``, and the empty ones of ``mask``; None: all count."""
+    return opaque if opaque is None else opaque | _both(mask, alpha <= 0.5)
+
+
+def _over(cut_out: Tensor, alpha: Tensor, behind: Colour, affine: Tensor | None) -> Tensor:
+    """Return a picture [H, W, 3], multiplied by its ``alpha`` [H, W], over a colour of the background.
+
+    ``affine`` [3, 4] maps that colour to the one in the picture.
+    """
+    colour = torch.tensor(behind)
+    if affine is not None:
+        colour = affine[:, :3].cpu() @ colour + affine[:, 3].cpu()
+    return cut_out + (1.0 - alpha)[..., None] * colour.to(alpha.device)
 
 
 def _numbers(camera: Camera) -> list[float]:

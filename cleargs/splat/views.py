@@ -16,7 +16,7 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.random_streams import Stream
 from cleargs.splat.camera import Camera
-from cleargs.types import AnyImage, MaskBool
+from cleargs.types import AnyImage, ArrayF32, MaskBool, MaskU8
 
 UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
 """Side, px, of the blocks that no training sees (1 % of a frame), and of the cells with one block each."""
@@ -39,6 +39,8 @@ class TrainingView:
     """True if the pose was estimated or adjusted; False if it is a pose of the input that fits the images."""
     time: float = math.nan
     """Capture time of the frame, s; without a clock, its number in the capture; NaN if neither is known."""
+    transparency: Callable[[], MaskU8 | None] | None = None
+    """Function that returns the alpha [H, W] of a cut-out, whose transparent pixels are empty; else None."""
 
 
 class ViewDataset(torch.utils.data.Dataset[dict[str, Any]]):
@@ -119,7 +121,9 @@ class ImageCache:
         self._white = torch.tensor(255.0, device=self._device)
         self._used = 0
         self._factor = 1.0
-        self._images: dict[TrainingView, tuple[Tensor, Tensor | None]] = {}
+        self._images: dict[TrainingView, tuple[Tensor, Tensor | None, Tensor | None]] = {}
+        self.alpha: Tensor | None = None
+        """Alpha [H, W] of the last image in a training, which is then multiplied by it; else None."""
         self._scratch: dict[tuple[int, int], Tensor] = {}
 
     def get(self, view: TrainingView, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
@@ -132,16 +136,17 @@ class ImageCache:
             self._used, self._factor = 0, factor
         entry = self._images.get(view)
         if entry is None:
-            pixels, counts = _prepare(view, factor, self._training)
+            pixels, counts, alpha = _prepare(view, factor, self._training)
             entry = (
                 torch.from_numpy(pixels).to(self._device),
                 None if counts is None else torch.from_numpy(counts).to(self._device),
+                None if alpha is None else torch.from_numpy(alpha).to(self._device),
             )
-            size = pixels.nbytes + (0 if counts is None else counts.nbytes)
+            size = sum(array.nbytes for array in (pixels, counts, alpha) if array is not None)
             if self._used + size <= self._limit:
                 self._images[view] = entry
                 self._used += size
-        stored, mask = entry
+        stored, mask, self.alpha = entry
         height, width = stored.shape[:2]
         if (height, width) not in self._scratch:
             self._scratch[height, width] = torch.empty(height, width, 3, device=self._device)
@@ -153,9 +158,17 @@ class ImageCache:
 
 def _prepare(
     view: TrainingView, factor: float, training: bool
-) -> tuple[NDArray[np.generic], MaskBool | None]:
-    """Load a view and resample it by pixel area; a reduced pixel counts if all pixels under it count."""
+) -> tuple[NDArray[np.generic], MaskBool | None, ArrayF32 | None]:
+    """Load a view and resample it by pixel area; a reduced pixel counts if all pixels under it count.
+
+    The third array is the alpha of a cut-out in a training, whose empty pixels count.
+    """
     image, mask = view.load()
+    levels = view.transparency() if training and view.transparency is not None else None
+    alpha = None if levels is None else levels.astype(np.float32) / np.float32(255)
+    if alpha is not None:
+        image = (image * alpha[..., None]).round().astype(image.dtype)
+        mask = None if mask is None else mask | (alpha <= 0.5)
     camera = view.camera.scaled(factor)
     expected = (view.camera.height, view.camera.width)
     if image.shape != (*expected, 3) or (mask is not None and mask.shape != expected):
@@ -171,4 +184,6 @@ def _prepare(
         if mask is not None:
             mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return (image if image.dtype == np.uint8 else image.astype(np.float16)), mask
+        if alpha is not None:
+            alpha = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), np.float32)
+    return (image if image.dtype == np.uint8 else image.astype(np.float16)), mask, alpha

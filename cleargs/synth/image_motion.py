@@ -80,7 +80,11 @@ class SimulatedMotion:
         poses = self.path.poses(times)
         local = np.einsum("tpk,tkj->tpj", self.points - poses[:, None, :, 3], poses[:, :, :3])
         focal = np.array([self.lens.fx, self.lens.fy])
-        return np.asarray(focal * local[..., :2] / np.maximum(local[..., 2:], 1e-6), np.float64)
+        places = local[..., :2] / np.maximum(local[..., 2:], 1e-6)
+        if self.lens.fisheye:
+            tangents = np.maximum(np.linalg.norm(places, axis=-1, keepdims=True), 1e-12)
+            places *= np.arctan(tangents) / tangents
+        return np.asarray(focal * places, np.float64)
 
 
 def track_motion(path: HandheldPath, time: float, depth: ArrayF64, lens: Lens) -> SimulatedMotion:
@@ -90,6 +94,9 @@ def track_motion(path: HandheldPath, time: float, depth: ArrayF64, lens: Lens) -
     x, y = np.meshgrid(columns, rows)
     z = depth[y.astype(int), x.astype(int)]
     rays = np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy, np.ones_like(x)], -1)
+    if lens.fisheye:
+        angles = np.linalg.norm(rays[..., :2], axis=-1, keepdims=True)
+        rays[..., :2] *= np.tan(angles) / angles
     seen = z > 0
     pose = path.poses(np.array([time]))[0]
     return SimulatedMotion(path, time, (rays * z[..., None])[seen] @ pose[:, :3].T + pose[:, 3], lens)

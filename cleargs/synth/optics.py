@@ -6,7 +6,7 @@ Poses are camera to world [3, 4] with OpenCV axes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import cv2
@@ -23,7 +23,7 @@ FIELD_OF_VIEW = math.radians(65)
 
 @dataclass(frozen=True)
 class Lens:
-    """Pinhole intrinsics in pixels; pixel centres are at + 0.5."""
+    """Intrinsics in pixels; pixel centres are at + 0.5."""
 
     width: int
     height: int
@@ -31,12 +31,39 @@ class Lens:
     fy: float
     cx: float
     cy: float
+    fisheye: bool = False
+    """True: equidistant, the distance from the principal point is the angle off the axis times fx."""
+
+    def zoomed(self, factor: float) -> Lens:
+        """Return the lens with ``factor`` times the focal lengths."""
+        return replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
 
 def phone_lens(width: int, height: int) -> Lens:
     """Return the lens of a phone's main camera."""
     focal = max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
     return Lens(width, height, focal, focal, width / 2, height / 2)
+
+
+LENSES = ("phone", "zoom", "switch", "breathing", "fisheye")
+"""Lenses of `lens_at`."""
+ZOOM, BREATHING, FISHEYE_VIEW = 1.8, 0.015, math.radians(122)
+"""Largest factor of the focal length; amplitude of a focal length that breathes with the focus; field of view
+of a fisheye across the longer side."""
+
+
+def lens_at(kind: str, first: Lens, share: float) -> Lens:
+    """Return the lens of ``kind`` at a ``share`` in [0, 1] of a capture that starts with the lens ``first``.
+
+    zoom: the focal length grows to `ZOOM` times the first. switch: it jumps there halfway. breathing: it
+    swings three times by `BREATHING`. fisheye: another lens, which does not change.
+    """
+    if kind == "fisheye":
+        focal = max(first.width, first.height) / FISHEYE_VIEW
+        return replace(first, fx=focal, fy=focal, fisheye=True)
+    swing = 1.0 + BREATHING * math.sin(6.0 * math.pi * share)
+    factors = {"zoom": ZOOM**share, "switch": ZOOM if share > 0.5 else 1.0, "breathing": swing}
+    return first.zoomed(factors[kind]) if kind in factors else first
 
 
 @dataclass(frozen=True)

@@ -297,6 +297,7 @@ def _render(
     fy: float,
     cx: float,
     cy: float,
+    fisheye: bool,  # without a thin lens
     primitives: NDArray[np.void],
     textures: NDArray[np.float32],
     light: ArrayF64,
@@ -322,13 +323,18 @@ def _render(
                 start[0] = ((column + jitter[number, 0] - cx) / fx) * focus - lens[number, 0]
                 start[1] = ((row + jitter[number, 1] - cy) / fy) * focus - lens[number, 1]
                 start[2] = focus
+                if fisheye:
+                    angle = math.sqrt(start[0] * start[0] + start[1] * start[1]) / focus
+                    start[2] *= math.cos(angle)
+                    for axis in range(2):
+                        start[axis] *= math.sin(angle) / max(angle, 1e-12)
                 norm = math.sqrt(_dot(start, start))
                 for axis in range(3):
                     ray[axis] = _dot(pose[axis], start) / norm
                     on_lens = pose[axis, 0] * lens[number, 0] + pose[axis, 1] * lens[number, 1]
                     origin[axis] = pose[axis, 3] + on_lens
                 distance, hit = _trace(origin, ray, 1 / fx, items, textures, light, colour, scratch)
-                depth[row, column] += distance * focus / norm / passes
+                depth[row, column] += distance * start[2] / norm / passes
                 brightness = 1.0
                 if hit >= first:
                     brightness = states[number, row, hit - first, 3]
@@ -380,8 +386,8 @@ class RoomWorld:
         points = np.ascontiguousarray(np.broadcast_to(aperture.points, (shutter.samples, 2)))
         _render(
             shutter.poses[shutter.index], low_discrepancy(shutter.samples), points, aperture.focus,
-            lens.fx, lens.fy, lens.cx, lens.cy, primitives, self.room.textures, self.room.light, states,
-            image, depth, share,
+            lens.fx, lens.fy, lens.cx, lens.cy, lens.fisheye,
+            primitives, self.room.textures, self.room.light, states, image, depth, share,
         )  # fmt: skip
         return image, depth, share
 

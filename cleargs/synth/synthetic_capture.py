@@ -22,7 +22,7 @@ from cleargs.random_streams import Stream
 from cleargs.synth import phone
 from cleargs.synth.image_motion import SimulatedMotion, track_motion
 from cleargs.synth.native_video import MOTION, NATIVE_FPS, STRIDE, native_frames, true_motion
-from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, distorted, instant_shutter
+from cleargs.synth.optics import LENSES, PINHOLE, Aperture, Lens, disc, distorted, instant_shutter, lens_at
 from cleargs.synth.path import FPS, SHOT_SECONDS, HandheldPath, SceneSetup, frame_times
 from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, Fault, Protocol, noisy_poses, plan_faults
 from cleargs.synth.raycast import room_setup
@@ -77,6 +77,7 @@ def make_capture(
     reporter: Reporter | None = None,
     setup: SceneSetup | None = None,
     video: bool = False,
+    lens: str = "phone",
 ) -> dict[str, Any]:
     """Write a capture into a new folder.
 
@@ -101,6 +102,7 @@ def make_capture(
         video: Write ``out/capture.mp4`` with 30 frames per second, of which the capture has every fifth, and
             ``out/truth/motion.parquet`` (`cleargs.synth.native_video.MOTION`). Without it, only the protocols
             of a phone write a video, with the frames of the capture.
+        lens: Lens of the frames, one of `cleargs.synth.optics.LENSES`.
 
     Returns:
         The contents of ``truth/capture.json``.
@@ -116,6 +118,8 @@ def make_capture(
     rules = PROTOCOLS.get(protocol)
     if rules is None:
         raise InputError(f"no protocol is called {protocol!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
+    if lens not in LENSES:
+        raise InputError(f"no lens is called {lens!r}", hint=f"choose one of {', '.join(LENSES)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")
     if video and rules.shots:
@@ -139,6 +143,7 @@ def make_capture(
     path = HandheldPath(setup.course, frames, seed, stretched=rules.stretched, shots=rules.shots)
     times = frame_times(frames, rate)
     poses = path.poses(times)
+    lenses = [lens_at(lens, setup.lens, number / max(1, frames - 1)) for number in range(frames)]
     rng, count = np.random.default_rng([seed, Stream.NOVEL_POSES]), max(4, frames // 4)
     novel = np.stack([setup.course.novel((number + 0.5) / count, rng) for number in range(count)])
     stems, novel_stems = ([f"{number:06d}" for number in range(views)] for views in (frames, count))
@@ -147,10 +152,12 @@ def make_capture(
         motions, depths, nearnesses, luminances = [], [], [], []
         for folder in ("observed/images", "observed/depth", "novel/images", "novel/depth"):
             (out / "truth" / folder).mkdir(parents=True)
-        for stem, time, pose in zip(stems, times, poses, strict=True):
-            light, depth = _write_sharp(out / "truth" / "observed", stem, setup, pose, look)
+        for stem, time, pose, own in zip(stems, times, poses, lenses, strict=True):
+            light, depth = _write_sharp(
+                out / "truth" / "observed", stem, replace(setup, lens=own), pose, look
+            )
             luminances.append(phone.metered_luminance(light))
-            motions.append(track_motion(path, float(time), depth, setup.lens))
+            motions.append(track_motion(path, float(time), depth, own))
             seen = depth[depth > 0]
             depths.append(float(seen.mean()))
             nearnesses.append(float((1 / seen).mean()))
@@ -189,6 +196,8 @@ def make_capture(
                         continue
                     # Not 0 at the end: NumPy reads such a seed like the shorter one of a chosen frame.
                     rng = np.random.default_rng([seed, Stream.EXPOSURES, chosen, place + 1])
+                    own = lens_at(lens, setup.lens, min(1.0, number / max(1, len(native) - 1)))
+                    motion = replace(motion, lens=own)
                     yield _shoot(setup, rules, look, motion, fault, nearnesses[chosen], rng)[0]
                     task.advance()
 
@@ -196,8 +205,11 @@ def make_capture(
             write_video(out / "capture.mp4", all_shots(), NATIVE_FPS, bits, repeatable=True)
             write_table(out / "truth" / "motion.parquet", true_motion(native, images), MOTION)
     write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), FRAMES)
-    for kind, names, exact in (("observed", stems, poses), ("novel", novel_stems, novel)):
-        _write_transforms(out / "truth" / kind, setup.lens, [f"images/{name}.png" for name in names], exact)
+    for kind, names, used, exact in (
+        ("observed", stems, lenses, poses),
+        ("novel", novel_stems, [setup.lens] * count, novel),
+    ):
+        _write_transforms(out / "truth" / kind, used, [f"images/{name}.png" for name in names], exact)
     mean_depth = float(np.mean(depths))
     noise = {"rotation_deg": rules.rotation_noise, "translation": rules.translation_noise * mean_depth}
     summary = {
@@ -212,6 +224,7 @@ def make_capture(
         "jpeg_quality": rules.jpeg,
         "codec_bits_per_pixel": processing["codec_bits_per_pixel"],
         "moving": setup.film is not None,
+        "lens": lens,
         "blur_px": _distribution([row["blur_px"] for row in rows]),
         "rolling_shutter_px": _distribution([row["rolling_shutter_px"] for row in rows]),
         "px_at_640": REFERENCE_WIDTH / width,
@@ -221,9 +234,8 @@ def make_capture(
         "pose_noise": noise if any(noise.values()) else None,  # standard deviations per axis
     }
     write_json(out / "truth" / "capture.json", summary)
-    wrong = 1 + rules.focal_error
-    lens = replace(setup.lens, fx=wrong * setup.lens.fx, fy=wrong * setup.lens.fy)
-    _write_transforms(out, lens, images, noisy_poses(poses, rules, mean_depth, seed))
+    wrong = [own.zoomed(1 + rules.focal_error) for own in lenses]
+    _write_transforms(out, wrong, images, noisy_poses(poses, rules, mean_depth, seed))
     return summary
 
 
@@ -237,22 +249,22 @@ def _shoot(
     rng: np.random.Generator,  # for the order of the points on the lens, and the noise
 ) -> tuple[ImageU8, ArrayF64]:
     """Return a frame before its codec, and per pixel [H, W] the share of the exposure that sees movement."""
-    shutter, aperture = motion.shutter(fault.exposure, fault.readout), PINHOLE
+    shutter, aperture, lens = motion.shutter(fault.exposure, fault.readout), PINHOLE, motion.lens
     if fault.defocus > 0:
         # `defocus` is the mean radius over the points of a uniform disc, which is 2/3 of the disc's radius.
         focus = NEAR_FOCUS / nearness
-        radius = 1.5 * fault.defocus / (setup.lens.fx * (1 / focus - nearness))
+        radius = 1.5 * fault.defocus / (lens.fx * (1 / focus - nearness))
         # With this number of points neighbours in the disc are about a pixel apart.
         repeats = math.ceil(math.ceil(4 * fault.defocus**2) / shutter.samples)
         shutter = replace(shutter, index=np.tile(shutter.index, (repeats, 1)))
         aperture = Aperture(disc(shutter.samples, radius)[rng.permutation(shutter.samples)], focus)
-    seen = np.zeros((setup.lens.height, setup.lens.width))
+    seen = np.zeros((lens.height, lens.width))
     if setup.film is None:
-        light = setup.world.render(shutter, setup.lens, aperture)
+        light = setup.world.render(shutter, lens, aperture)
     else:
-        light, seen = setup.film(shutter, setup.lens, aperture)
+        light, seen = setup.film(shutter, lens, aperture)
     if any(rules.distortion):
-        light = distorted(light, setup.lens, rules.distortion)
+        light = distorted(light, lens, rules.distortion)
     return phone.develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look), seen
 
 
@@ -285,13 +297,19 @@ def _row(number: int, image: str, motion: SimulatedMotion, fault: Fault, rate: f
     }
 
 
-def _write_transforms(folder: Path, lens: Lens, images: Sequence[str], poses: ArrayF64) -> None:  # [F, 3, 4]
-    """Write ``transforms.json`` as nerfstudio reads it, with OpenGL camera-to-world matrices."""
-    frames = []
-    for image, pose in zip(images, poses, strict=True):
+def _write_transforms(folder: Path, lenses: Sequence[Lens], images: Sequence[str], poses: ArrayF64) -> None:
+    """Write ``transforms.json`` as nerfstudio reads it, with OpenGL camera-to-world matrices.
+
+    Focal lengths are those of each frame if the ``lenses`` of the ``poses`` [F, 3, 4] differ.
+    """
+    lens, frames = lenses[0], []
+    several = len(set(lenses)) > 1
+    for image, pose, own in zip(images, poses, lenses, strict=True):
         matrix = np.vstack([pose, [0, 0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": image, "transform_matrix": matrix.tolist()})
-    camera = {"camera_model": "OPENCV", "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+        focal = {"fl_x": own.fx, "fl_y": own.fy} if several else {}
+        frames.append({"file_path": image, "transform_matrix": matrix.tolist(), **focal})
+    model = "OPENCV_FISHEYE" if lens.fisheye else "OPENCV"
+    camera = {"camera_model": model, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
     write_json(folder / "transforms.json", {**camera, "w": lens.width, "h": lens.height, "frames": frames})
 
 

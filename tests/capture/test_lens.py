@@ -54,7 +54,7 @@ def test_few_frames_measure_the_lens(
 
     monkeypatch.setattr(adjustment, "_LENS_FRAMES", FEW)
     model = capture(tmp_path / "matches.db", lens, params)
-    measured = adjustment.Adjuster(tmp_path / "matches.db", triangulate).with_measured_lens(model)
+    measured, _ = adjustment.Adjuster(tmp_path / "matches.db", triangulate).with_measured_lens(model)
 
     changed = lens == adjustment.FULL_LENS
     assert frames == [FEW] * 3 + [FRAMES] * 2 * changed

@@ -62,7 +62,7 @@ def test_neighbours_of_frames_that_are_left_out_get_new_features_too() -> None:
 def test_a_try_that_loses_a_frame_is_not_taken() -> None:
     placer = Placer([set(range(8)), set(range(1, 12))])
     model, placed = placer._place_the_rest(made(set(range(8))), PAIRS)
-    assert len(model.images) == 8 and placer._matched == Path("database.db")
+    assert len(model.images) == 8 and placer.used_database == Path("database.db")
     assert [placed[name] for name in NAMES] == ["sfm"] * 8 + ["why"] * 4
 
 

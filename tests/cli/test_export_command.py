@@ -152,3 +152,38 @@ def test_what_a_format_loses_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert invoke(["export", str(run), "-o", str(tmp_path / "y.spz"), "--metres", "0-1=0.00001"]) == 2
     cause, remedy = capsys.readouterr().err.splitlines()
     assert "cannot hold" in cause and ".sog" in remedy and not (tmp_path / "y.spz").exists()
+
+
+@pytest.mark.parametrize(
+    ("side", "axis"), [("top", [0, -1, 0]), ("left", [-1, 0, 0]), ("right", [1, 0, 0]), ("bottom", [0, 1, 0])]
+)
+@pytest.mark.parametrize("up", [None, "z"])
+def test_the_side_of_a_picture_is_turned_up(
+    run: Path, tmp_path: Path, side: str, axis: list[int], up: str | None
+) -> None:
+    assert export(run, tmp_path / "a.ply", "--upright", f"2:{side}", *(["--up", up] if up else [])) == 0
+    stood = json.loads((tmp_path / "a.cameras.json").read_text())
+    assert np.allclose(np.array(stood[2]["rotation"]) @ axis, [0, 0, 1] if up else [0, -1, 0], atol=1e-6)
+    assert not up or np.allclose(stood[0]["position"], 0, atol=1e-6)
+
+
+def test_a_direction_is_turned_up(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export(run, tmp_path / "a.ply") == 0 and export(run, tmp_path / "b.ply", "--upright", "0,0,2") == 0
+    before, after = (
+        np.array([camera["rotation"] for camera in json.loads((tmp_path / f"{n}.cameras.json").read_text())])
+        for n in "ab"
+    )
+    turn = after[0] @ before[0].T
+    assert np.allclose(turn @ [0, 0, 1], [0, -1, 0], atol=1e-6) and np.allclose(
+        after, turn @ before, atol=1e-6
+    )
+    assert (
+        invoke(["export", str(tmp_path / "a.ply"), "-o", str(tmp_path / "c.ply"), "--upright", "0,0,2"]) == 0
+    )
+    assert np.allclose(
+        read_ply(tmp_path / "b.ply").gaussians.means, read_ply(tmp_path / "c.ply").gaussians.means, atol=1e-5
+    )
+    for wrong in ("99:top", "0:up", "0,0,0", "1,2", "nan,0,1"):
+        capsys.readouterr()
+        assert export(run, tmp_path / "d.ply", "--upright", wrong) == 2
+        assert "--upright" in capsys.readouterr().err

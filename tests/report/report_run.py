@@ -215,7 +215,7 @@ class FinishedRun:
         ]
         write_table(folder / "train.parquet", pa.Table.from_pylist(rows, TRAIN), TRAIN)
         trained_on = [frame for frame in range(5) if frame not in self.held_out]
-        gains = np.linspace(0.8, 1.2, len(trained_on))
+        gains = np.linspace(0.8, 1.2, len(trained_on))[:, None].repeat(3, axis=1)
         write_exposure(folder / "exposure.parquet", Exposure.from_gains(trained_on, gains))
         if stage == "consolidate":
             write_repairs(folder / "repairs.parquet", latest_accepted(self.selections))

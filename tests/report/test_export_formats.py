@@ -18,10 +18,10 @@ from cleargs.capture.model import read_model
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
+from cleargs.formation.frames import camera_of
 from cleargs.formation.observed import Fit
 from cleargs.named_views import keep_views
 from cleargs.render import pruning
-from cleargs.report.frames import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.formats import FORMATS
 from cleargs.splat.ply import read_ply

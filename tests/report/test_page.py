@@ -8,6 +8,7 @@ import re
 import shutil
 from base64 import b64decode
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +25,7 @@ from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
 from cleargs.formation.movement import write_movement
 from cleargs.manifest import Manifest, linked_manifest, write_manifest
+from cleargs.media.image import write_mask
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
 from cleargs.report.advice import command
@@ -314,6 +316,21 @@ def test_what_moves_in_a_frame_is_a_layer(tmp_path: Path) -> None:
     row = load_rows(run.folder, linked_manifests(run.folder, run.dag.names))[2]
     layers = layers_of(row, run.folder)
     change = np.abs(layers["moving"].astype(int) - layers["observed"]).max(axis=2)
+    assert (change[:, 48:] <= 1).all() and (change[:, :48] > 10).mean() > 0.9
+
+
+def test_what_a_mask_leaves_out_is_a_layer(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    rows = load_rows(run.folder, linked_manifests(run.folder, run.dag.names))
+    observed = layers_of(rows[2], run.folder)["observed"]
+    (run.folder / "ingest/masks").mkdir()
+    for mask in (np.full(observed.shape[:2], 255, np.uint8), np.zeros(observed.shape[:2], np.uint8)):
+        mask[:, 48:] = 255
+        write_mask(run.folder / "ingest/masks/000002.png", mask)
+        row = replace(rows[2], frame=replace(rows[2].frame, mask="masks/000002.png"))
+        layers = layers_of(row, run.folder)
+        assert ("masked" in layers) == (not mask.all())
+    change = np.abs(layers["masked"].astype(int) - layers["observed"]).max(axis=2)
     assert (change[:, 48:] <= 1).all() and (change[:, :48] > 10).mean() > 0.9
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.splat_toy import HEIGHT, WIDTH, camera, keep
+from numpy.typing import NDArray
 
 from cleargs.formation.exposure import (
     IDENTITY,
@@ -24,7 +26,7 @@ from cleargs.splat.views import TrainingView
 WALL = 0.2
 
 
-def wall(gains: list[float]) -> tuple[list[TrainingView], SparsePoints]:
+def wall(gains: Sequence[float | NDArray[np.float64]]) -> tuple[list[TrainingView], SparsePoints]:
     """Return views of a textured wall with these gains, and points on the wall with the colours of gain 1."""
     rng = np.random.default_rng(0)
     texture = rng.uniform(60, 180, (HEIGHT, WIDTH, 3))
@@ -49,9 +51,21 @@ def test_gains_are_measured_on_the_points() -> None:
     measured = frame_gains(*wall(gains))
     # Pixels are integers between 48 and 234, three are summed, and the median is taken: the error is below
     # 0.5 %.
-    np.testing.assert_allclose(measured, gains, rtol=5e-3)
-    assert gain_spread(measured) == pytest.approx(np.log(gains).std(), rel=0.02)
-    assert gain_spread(frame_gains(*wall([1.0, 1.0, 1.0]))) < 0.002
+    np.testing.assert_allclose(measured, np.array(gains)[:, None].repeat(3, axis=1), rtol=6e-3)
+    brightness, colour = gain_spread(measured)
+    assert brightness == pytest.approx(np.log(gains).std(), rel=0.02) and colour < 0.005
+    assert max(gain_spread(frame_gains(*wall([1.0, 1.0, 1.0])))) < 0.002
+
+
+def test_a_white_balance_spreads_the_colours_and_not_the_brightness() -> None:
+    cold, warm = [0.85, 1.0, 1.15], [1.15, 1.0, 0.85]
+    gains = frame_gains(*wall([np.array(cold), np.array(warm)] * 2))
+    brightness, colour = gain_spread(gains)
+    assert brightness < 0.01 and colour == pytest.approx(0.15, abs=0.01)
+    start = Exposure.from_gains([0, 1, 2, 3], gains)
+    np.testing.assert_allclose(
+        start.of(0)[:, :3] / start.of(1)[:, :3].diagonal(), np.diag(cold) / warm, rtol=0.02
+    )
 
 
 def test_masked_and_invisible_points_do_not_count() -> None:
@@ -60,7 +74,7 @@ def test_masked_and_invisible_points_do_not_count() -> None:
     assert np.isnan(frame_gains([nothing], sparse)).all()
     behind = replace(sparse, xyz=sparse.xyz * [1, 1, -20])
     assert np.isnan(frame_gains(views, behind)).all()
-    assert gain_spread(np.array([np.nan])) == 0.0
+    assert gain_spread(np.full((1, 3), np.nan)) == (0.0, 0.0)
 
 
 def test_the_weighted_median_is_the_identity() -> None:
@@ -76,7 +90,7 @@ def test_the_weighted_median_is_the_identity() -> None:
 
 def test_a_few_dark_frames_do_not_move_the_others() -> None:
     """With the mean as reference, two dark frames out of ten made the scene 10 % too dark."""
-    gains = np.array([0.5, 1.0, 1.01, 0.99, np.nan, 1.0, 0.5, 1.0, 1.02, 0.98])
+    gains = np.array([0.5, 1.0, 1.01, 0.99, np.nan, 1.0, 0.5, 1.0, 1.02, 0.98])[:, None].repeat(3, axis=1)
     frame_ids = [9, 8, 7, 6, 5, 4, 3, 2, 1, 0]
     start = Exposure.from_gains(frame_ids, gains)
     assert start.frame_ids.tolist() == list(range(10))

@@ -7,7 +7,8 @@ import pytest
 import torch
 from test_export import make_scene
 
-from cleargs.render.pruning import central_box, contributions, inside
+from cleargs.formation.dust import contributions
+from cleargs.render.pruning import central_box, inside
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render

@@ -52,6 +52,8 @@ class _App(NamedTuple):
     """Files of poses and cameras. If each pattern has a file, the app wrote the folder."""
     read: Callable[[list[Path], Sequence[Path]], _Poses]
     """Function from these files and the pictures to the poses."""
+    gravity: bool = False
+    """True if y is up in its world, by the phone's sensors (ARKit)."""
 
     def files(self, source: Path) -> list[Path]:
         """Return the files of poses and cameras below ``source``; none if another app wrote it."""
@@ -90,6 +92,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     except InputError as error:
         capture: Capture = (video if contents.is_video else images).open_capture(source, config)
         return replace(capture, notes=(*capture.notes, f"{error}; poses are found from the images"))
+    if app.gravity:
+        frames = [replace(f, up=tuple(f.pose.rotation[:, 1].tolist())) if f.pose else f for f in frames]
     taken = chosen(frames, source, config.max_frames)
     told = f"{contents.told()}; {len(placed)} poses of {app.name}"
     return Capture("rgbd", taken, len(frames), told=told, notes=contents.warnings())
@@ -235,12 +239,12 @@ def _scannet(files: list[Path], photographs: Sequence[Path]) -> _Poses:
 
 
 _APPS = (
-    _App("Stray Scanner", ("camera_matrix.csv", "odometry.csv"), _stray),
+    _App("Stray Scanner", ("camera_matrix.csv", "odometry.csv"), _stray, gravity=True),
     _App("TUM RGB-D", ("rgb.txt", "groundtruth.txt"), _tum),
-    _App("Record3D", ("metadata.json", "rgb/0.*"), _record3d),
-    _App("Polycam", ("keyframes/*cameras/*.json",), _polycam),
-    _App("Polycam", ("*cameras/*.json",), _polycam),
-    _App("3D Scanner App", ("frame_*.json",), _scanner),
+    _App("Record3D", ("metadata.json", "rgb/0.*"), _record3d, gravity=True),
+    _App("Polycam", ("keyframes/*cameras/*.json",), _polycam, gravity=True),
+    _App("Polycam", ("*cameras/*.json",), _polycam, gravity=True),
+    _App("3D Scanner App", ("frame_*.json",), _scanner, gravity=True),
     _App("ScanNet", ("pose/*.txt", "intrinsic/intrinsic_color.txt"), _scannet),
     _App("7-Scenes", ("*.pose.txt",), _scannet),
 )

@@ -1,0 +1,85 @@
+"""Dust: Gaussians that no training view shows, which make the box of a scene many times too large."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cleargs.capture.folders import spread
+from cleargs.formation.exposure import Exposure
+from cleargs.formation.frame import FrameFormation
+from cleargs.formation.observed import MAX_EVALUATED, Fit, evaluate_views
+from cleargs.splat.backend import mean_psnr, rasteriser_for
+from cleargs.splat.camera import Camera
+from cleargs.splat.constants import SH_C0
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.scene import Scene
+from cleargs.splat.trainer import Trained
+from cleargs.splat.views import TrainingView
+from cleargs.types import MaskBool
+
+DUST = 0.1
+"""Largest contribution of a Gaussian to a training view, pixels, below which it is dust."""
+MAX_LOSS = 0.02
+"""Loss of PSNR on the training views, dB, above which the dust stays."""
+
+
+class Dusted(NamedTuple):
+    """A training without dust, and how well its scene fits the views that were compared."""
+
+    trained: Trained
+    compared: list[TrainingView]
+    fits: list[Fit]
+
+
+def without_dust(
+    trained: Trained,
+    views: Sequence[TrainingView],  # that the training used
+    exposure: Exposure | None,
+    formations: Mapping[int, FrameFormation],
+    moving: Mapping[int, MaskBool],
+    device: str,
+) -> Dusted:
+    """Remove the `DUST` of a training, and its moments of Adam, if the raw frames lose at most `MAX_LOSS`."""
+    real = [view for view in views if view.kind == "real"]
+    few, scene = spread(real, MAX_EVALUATED), trained.scene.to(device)
+    largest = contributions(scene, (view.camera for view in real), lambda: None)
+    seen = largest >= DUST
+    smaller = replace(scene, gaussians=scene.gaussians.select(seen))
+    before, after = (
+        evaluate_views(one, few, exposure, formations, moving=moving) for one in (scene, smaller)
+    )
+    psnr = [mean_psnr(fit.psnr for fit in fits) or 0.0 for fits in (before, after)]
+    if not seen.any() or psnr[1] < psnr[0] - MAX_LOSS:
+        return Dusted(trained, few, before)
+    kept = seen.cpu()
+    state = {
+        name: tensor[kept] if name.startswith(("first.", "second.", "strategy.")) else tensor
+        for name, tensor in trained.state.items()
+    }
+    return Dusted(replace(trained, scene=smaller.to("cpu"), state=state), few, after)
+
+
+def contributions(scene: Scene, cameras: Iterable[Camera], advance: Callable[[], None]) -> Tensor:  # [N]
+    """Return the largest contribution of each Gaussian to one picture, in pixels.
+
+    The contribution is the sum over pixels of the blending weight (opacity times the transmittance in front).
+    A pixel's colour is the sum of weight times colour, so this is the gradient of the sum of the picture with
+    respect to the colour of the Gaussian. All colours are set to grey, because a colour that is clamped at 0
+    has no gradient. ``advance`` is called after each camera.
+    """
+    gaussians = scene.gaussians.detach()
+    grey = Gaussians(**{**gaussians.tensors(), "sh": torch.zeros_like(gaussians.sh[:, :1])})
+    engine = rasteriser_for(gaussians.device)
+    largest = torch.zeros(gaussians.num, device=gaussians.device)
+    for camera in cameras:
+        image = engine.forward(grey, camera, antialias=scene.antialias).image
+        red_gradient = torch.zeros_like(image)
+        red_gradient[..., 0] = 1.0 / SH_C0
+        torch.maximum(largest, engine.backward(red_gradient).sh[:, 0, 0], out=largest)
+        advance()
+    return largest

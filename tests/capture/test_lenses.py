@@ -1,0 +1,168 @@
+"""Lenses that change or bend, and the figure by which they are found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from cleargs.capture.colmap import pycolmap
+from cleargs.capture.config import SfmConfig
+from cleargs.capture.kept_out import all_tracks
+from cleargs.capture.lenses import is_impossible
+from cleargs.capture.prediction import prediction_errors, scales_differ
+from cleargs.capture.sfm import contradictions
+from cleargs.capture.sfm_job import Prediction, SfmOutcome
+from cleargs.errors import StageError
+from cleargs.progress import SilentReporter
+
+from .conftest import FOCAL, HEIGHT, PLANES, WIDTH, Ingest, Ingested, camera_to_world, texture
+
+FRAMES = 12
+Rays = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+def perspective(focal: float) -> Rays:
+    return lambda x, y: (x / focal, y / focal)
+
+
+def fisheye(focal: float) -> Rays:
+    def tangents(
+        x: NDArray[np.float64], y: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        angle = np.hypot(x, y) / focal
+        scale = np.tan(angle) / (angle * focal)
+        return scale * x, scale * y
+
+    return tangents
+
+
+def film(folder: Path, lenses: list[Rays]) -> list[NDArray[np.float64]]:
+    """Write a frame per lens, along an arc before planes and a far wall. Return the camera centres."""
+    folder.mkdir()
+    poses = camera_to_world(len(lenses))
+    columns, rows = np.meshgrid(np.arange(2 * WIDTH) + 0.5, np.arange(2 * HEIGHT) + 0.5)
+    planes = [(7.0, -16.0, -16.0, 32.0), *PLANES]
+    pictures = [texture(number, 2048 if number == 0 else 512) for number in range(len(planes))]
+    for number, (pose, lens) in enumerate(zip(poses, lenses, strict=True)):
+        x, y = lens((columns - WIDTH) / 2, (rows - HEIGHT) / 2)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+        image = np.full((2 * HEIGHT, 2 * WIDTH, 3), 90, np.uint8)
+        for (depth, left, top, size), picture in zip(planes, pictures, strict=True):
+            ahead = rays[..., 2] > 0.05
+            reach = (depth - pose[2, 3]) / np.where(ahead, rays[..., 2], 1.0)
+            place = pose[:2, 3] + reach[..., None] * rays[..., :2]
+            cells = ((place - [left, top]) / size * len(picture) - 0.5).astype(np.float32)
+            seen = cv2.remap(picture, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR)
+            inside = ahead & ((cells > 0) & (cells < len(picture) - 1)).all(axis=2)
+            image = np.where(inside[..., None], seen, image)
+        small = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(folder / f"view{number:02d}.png"), np.asarray(small))
+    return [pose[:3, 3] for pose in poses]
+
+
+def centre_error(done: Ingested, true: list[NDArray[np.float64]]) -> float:
+    """Return the error (rms) of the camera centres after a similarity, as a share of their mean distance."""
+    frames = pq.read_table(done.out / "frames.parquet").to_pylist()
+    assert all(frame["registered"] for frame in frames)
+    found = []
+    for frame in frames:
+        turn = pycolmap.Rotation3d(np.array([frame[name] for name in ("qx", "qy", "qz", "qw")])).matrix()
+        found.append(-turn.T @ np.array([frame[name] for name in ("tx", "ty", "tz")]))
+    a, b = np.array(found), np.array(true)
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    fit = (s @ np.diag(sign)) / (a**2).sum() * a @ (u @ sign @ vt).T
+    return float(np.sqrt(((fit - b) ** 2).sum(axis=1).mean()) / np.linalg.norm(b, axis=1).mean())
+
+
+def test_a_zoom_gets_a_focal_length_per_frame(tmp_path: Path, ingest: Ingest) -> None:
+    focal = FOCAL * 1.6 ** np.linspace(0, 1, FRAMES)
+    true = film(tmp_path / "zoom", [perspective(value) for value in focal])
+    done = ingest(tmp_path / "zoom")
+    assert centre_error(done, true) < 0.01
+    row = done.result.summary["cameras"][0]
+    assert row["frames"] == FRAMES
+    np.testing.assert_allclose(row["focal_range_px"], [focal[0], focal[-1]], rtol=0.02)
+    assert any("focal length changes" in text and "view00.png" in text for text in done.warnings)
+    figure = done.result.summary["kept_out"]
+    assert figure["share"] > 0.9 and figure["median_px"] < 0.5
+    frames = pq.read_table(done.out / "frames.parquet").to_pylist()
+    assert sum(frame["kept_out_keypoints"] for frame in frames) == figure["keypoints"]
+
+
+@pytest.mark.slow
+def test_a_fisheye_is_found_without_exif(tmp_path: Path, ingest: Ingest) -> None:
+    true = film(tmp_path / "fisheye", [fisheye(150.0)] * FRAMES)
+    done = ingest(tmp_path / "fisheye")
+    row = done.result.summary["cameras"][0]
+    assert row["lens"] == "OPENCV_FISHEYE" and row["focal_px"] == pytest.approx(150, rel=0.02)
+    assert centre_error(done, true) < 0.01
+
+
+def test_a_field_of_view_or_a_focal_length_can_be_stated() -> None:
+    assert SfmConfig(focal="450px").focal_share("PINHOLE", 900) == 0.5
+    assert SfmConfig.model_validate({"focal": 450}).focal_share("OPENCV_FISHEYE", 900) == 0.5
+    assert SfmConfig(focal="90deg").focal_share("OPENCV", 900) == pytest.approx(0.5)
+    assert SfmConfig(focal="122 °").focal_share("OPENCV_FISHEYE", 9) == pytest.approx(1 / np.radians(122))
+    for wrong in ("0", "-3", "wide", "400deg", "3rad"):
+        with pytest.raises(ValidationError, match="focal"):
+            SfmConfig(focal=wrong)
+
+
+def test_lenses_that_nobody_builds_are_impossible() -> None:
+    def lens(fx: float, fy: float) -> pycolmap.Camera:
+        return pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[fx, fy, 160, 120])
+
+    assert not is_impossible(lens(250, 260))
+    assert all(map(is_impossible, (lens(173, 250), lens(31, 31), lens(4161, 4161))))
+    stated = lens(4161, 4161)
+    stated.has_prior_focal_length = True
+    assert not is_impossible(stated)
+
+
+def test_the_figure_decides_between_placed_in_part_and_failed() -> None:
+    def said(share: float, keypoints: int = 1000) -> tuple[str, ...]:
+        found = Prediction(keypoints=keypoints, share=share, median_px=1.0)
+        return contradictions(SfmOutcome(prediction=found, method="sfm"), SfmConfig(), SilentReporter())
+
+    assert said(0.9) == () == said(0.1, keypoints=20)
+    assert contradictions(SfmOutcome(), SfmConfig(), SilentReporter()) == ()
+    assert "only" not in said(0.4)[0] and "40% are within 2 px" in said(0.4)[0]
+    with pytest.raises(StageError, match="the cameras are wrong"):
+        said(0.2)
+
+
+def test_kept_out_keypoints_show_a_wrong_pose_and_another_scale(tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=8)
+    options.num_points3D, options.num_points2D_without_point3D = 400, 0
+    with pycolmap.Database.open(tmp_path / "matches.db") as opened:
+        model = pycolmap.synthesize_dataset(options, opened)
+    tracks = all_tracks(tmp_path / "matches.db")
+    right = prediction_errors(tracks, model)
+    assert len(right) > 1000 and np.nanmax(right) < 1e-3  # exact keypoints
+    assert not scales_differ(tracks, model, 5)
+
+    def with_second_half_scaled(factor: float) -> pycolmap.Reconstruction:
+        other = pycolmap.Reconstruction(model)
+        pivot = other.images[5].projection_center()
+        for key, image in other.images.items():
+            if key >= 5:
+                turn = image.cam_from_world().rotation.matrix()
+                centre = pivot + factor * (image.projection_center() - pivot)
+                pose = pycolmap.Rigid3d(np.column_stack([turn, -turn @ centre]))
+                other.frames[image.frame_id].rig_from_world = pose
+        return other
+
+    assert scales_differ(tracks, with_second_half_scaled(1.1), 5)
+    assert scales_differ(tracks, with_second_half_scaled(1 / 1.1), 5)
+    assert not scales_differ(tracks, with_second_half_scaled(1.005), 5)
+    wrong = prediction_errors(tracks, with_second_half_scaled(1.1))
+    assert (wrong > 5.0).mean() > 0.25  # the smaller side of each track

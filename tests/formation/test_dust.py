@@ -1,0 +1,64 @@
+"""Gaussians that no training view shows are dropped, with their moments, if the frames lose nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pyarrow as pa
+import torch
+from helpers import splat_toy
+
+from cleargs.formation.dust import MAX_LOSS, without_dust
+from cleargs.splat.backend import mean_psnr
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.scene import Scene
+from cleargs.splat.trainer import Trained
+from cleargs.splat.types import Moments
+
+
+def trained(gaussians: Gaussians) -> Trained:
+    """A finished training whose moments are numbered by Gaussian."""
+    moments = Moments.zeros(gaussians)
+    for tensors in (moments.first, moments.second):
+        for tensor in tensors.values():
+            tensor += torch.arange(gaussians.num).reshape(-1, *[1] * (tensor.ndim - 1))
+    state = {
+        "fingerprint": torch.zeros(32),
+        **moments.state(),
+        "strategy.errors": torch.arange(gaussians.num),
+    }
+    return Trained(Scene(gaussians), pa.table({}), state)
+
+
+def together(first: Gaussians, second: Gaussians) -> Gaussians:
+    other = second.tensors()
+    return Gaussians(**{name: torch.cat([tensor, other[name]]) for name, tensor in first.tensors().items()})
+
+
+def test_dust_is_dropped_with_its_moments() -> None:
+    truth = splat_toy.gaussians()
+    pictures = splat_toy.views(splat_toy.images(truth, 4))
+    far = replace(truth.select(torch.arange(5)), means=torch.tensor([[0.0, 90.0, 0.0]]).repeat(5, 1))
+    done = without_dust(trained(together(far, truth)), pictures, None, {}, {}, "cpu")
+    kept = done.trained.scene.gaussians
+    assert kept.num <= truth.num and float(kept.means.abs().max()) < 1
+    numbers = done.trained.state["first.logit_opacities"]
+    assert len(numbers) == kept.num and int(numbers.min()) >= 5
+    assert torch.equal(numbers, done.trained.state["strategy.errors"].to(numbers.dtype))
+    assert torch.equal(kept.means, together(far, truth).means[numbers.long()])
+    assert len(done.trained.state["fingerprint"]) == 32
+    assert len(done.fits) == len(done.compared) == 4
+
+
+def test_faint_gaussians_that_show_together_stay() -> None:
+    """A haze of many Gaussians, each of a hundredth of a pixel."""
+    truth = splat_toy.gaussians()
+    haze = splat_toy.gaussians(8000, seed=3)
+    haze = replace(haze, log_scales=haze.log_scales - 1.0, logit_opacities=torch.full((haze.num,), -5.0))
+    both = together(haze, truth)
+    pictures = splat_toy.views(splat_toy.images(both, 4))
+    whole = without_dust(trained(both), pictures, None, {}, {}, "cpu")
+    assert torch.equal(whole.trained.scene.gaussians.means, both.means)
+    fits = without_dust(trained(truth), pictures, None, {}, {}, "cpu").fits
+    lost = mean_psnr(fit.psnr for fit in whole.fits), mean_psnr(fit.psnr for fit in fits)
+    assert lost[0] is not None and lost[1] is not None and lost[0] - lost[1] > MAX_LOSS
