@@ -15,6 +15,7 @@ class Stream(IntEnum):
     BACKGROUND = 4
     RIVR = 5
     CONSOLIDATION = 6
+    TEXTURE = 7
     ADDED_POINTS = 100
     LEFT_OUT_POINTS = 101
     UNSEEN_PIXELS = 102

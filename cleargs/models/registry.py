@@ -21,7 +21,7 @@ from cleargs.safe_io import read_json
 
 T = TypeVar("T")
 
-Role = Literal["expert", "scorer", "metric"]
+Role = Literal["expert", "scorer", "metric", "loss"]
 State = Literal["shipped", "installed", "not installed", "incomplete"]
 Converter = Literal["lpips", "spandrel", "musiq", "clip-iqa"]
 

@@ -112,6 +112,12 @@ class TrainConfig(FrozenModel):
         "that what was filmed becomes opaque",
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="weight of D-SSIM in the loss; L1 has the rest")
+    texture: float = Field(
+        0.1,
+        ge=0,
+        description="weight of the term of the loss that compares texture, in the last 30 % of the schedule; "
+        "0 = off",
+    )
     coarse_share: float = Field(
         0.25, ge=0, le=1, description="fraction of the schedule, at its start, with reduced images; 0 = off"
     )

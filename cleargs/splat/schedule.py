@@ -25,6 +25,10 @@ ERROR_STEPS = 5
 """Number of steps before a refinement that measure its errors, one frame each. Each costs a backward pass, so
 at most an eighth of the steps between refinements measure errors."""
 
+TEXTURE_FROM, TEXTURE_EVERY = 0.7, 3
+"""Share of the schedule from which the term of texture is in the loss of every third step. Earlier,
+shapes are coarse (docs/experiments/training.md)."""
+
 
 def rate_factor(steps: int) -> float:
     """Return the factor on the rates of means, scales, rotations and SH for a schedule of ``steps`` steps.
@@ -89,6 +93,10 @@ class Schedule:
         """Return the SH degree to render, at most the stored degree ``largest``."""
         every = self._config.sh_every * self._config.planned
         return largest if every == 0 else min(largest, int(step / every))
+
+    def sees_texture(self, step: int) -> bool:
+        """Return True if the next step has the term of texture in its loss."""
+        return step >= TEXTURE_FROM * self._config.planned and step % TEXTURE_EVERY == 0
 
     def refines(self, step: int) -> bool:
         """Return True if a refinement is due after ``step`` steps."""

@@ -40,6 +40,7 @@ from cleargs.splat.kernels.rasteriser import view_numbers
 from cleargs.splat.scene import Colour, Scene
 from cleargs.splat.schedule import Schedule, random_grey
 from cleargs.splat.state import load_state, save_state
+from cleargs.splat.texture import TextureLoss, crop_of
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, TrainingView, require_views
@@ -112,6 +113,7 @@ class Trainer:
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
         self._losses = LossAccumulator(self._device, config.ssim_lambda)
+        self._texture = TextureLoss(self._device) if config.texture > 0.0 else None
         self._log = TrainLog(self.length)
         self._image_gradients: dict[tuple[int, int], Tensor] = {}
         others: list[float | str] = [*self._seed, self._earlier_steps, self._pseudo_share, pseudo_weight]
@@ -222,7 +224,13 @@ class Trainer:
             mask = mask if formed is None else _with_empty(formed.mask, mask, alpha)
         image, too_bright = recorded(image, target)
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
-        gradient = self._add_loss(image, target, mask, weight).masked_fill_(too_bright, 0.0)
+        gradient = self._add_loss(image, target, mask, weight)
+        if self._texture is not None and self._schedule.sees_texture(schedule_step):
+            crop = crop_of(self._seed, schedule_step, *target.shape[:2])
+            share = config.texture * weight * image[crop].numel() / image.numel()
+            hidden = None if mask is None else mask[crop]
+            gradient[crop] += share * self._texture.gradient(image[crop], target[crop], hidden)
+        gradient.masked_fill_(too_bright, 0.0)
         if config.densify and self._schedule.wants_errors(schedule_step):
             errors = self._error_per_gaussian(image, target, mask, weight, formed)
             self._errors = errors if self._errors is None else self._errors + errors
