@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Pose
 from cleargs.capture.folders import is_inside
 from cleargs.errors import StoreError
 from cleargs.parquet import column, read_table, schema_of
+
+if TYPE_CHECKING:
+    from cleargs.capture.cameras import Pose
 
 _POSE = "world to camera (COLMAP, OpenCV axes); null when unregistered"
 _Size = Annotated[int, "of the undistorted image, px"]
@@ -68,6 +70,10 @@ class Frame:
     @property
     def pose(self) -> Pose:
         """Pose in the normalised world. Raises ValueError if the frame has none."""
+        from cleargs.capture.cameras import (
+            Pose,  # it needs SciPy, which commands that only read tables do not load
+        )
+
         numbers = self.qw, self.qx, self.qy, self.qz, self.tx, self.ty, self.tz
         known = np.array([number for number in numbers if number is not None], np.float64)
         if not self.registered or len(known) < len(numbers) or np.isnan(known).any():

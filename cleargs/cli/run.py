@@ -13,7 +13,6 @@ import click
 from click.core import ParameterSource
 
 import cleargs
-from cleargs.capture.sfm_job import GOOD_SHARE
 from cleargs.capture.sources import whole_capture
 from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
@@ -345,6 +344,8 @@ def _trust(kept_out: Mapping[str, Any] | None) -> str:
     figure = (
         f"{kept_out['share']:.0%} of kept-out keypoints within 2 px, median {kept_out['median_px']:.2g} px"
     )
+    from cleargs.capture.sfm_job import GOOD_SHARE
+
     return f"{'placed' if kept_out['share'] >= GOOD_SHARE else 'with doubtful cameras'}: {figure}"
 
 

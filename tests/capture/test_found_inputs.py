@@ -17,7 +17,7 @@ from cleargs.capture.choice import select_sharp_frames
 from cleargs.capture.model import read_model, write_model
 from cleargs.capture.sources import externals, open_capture
 from cleargs.capture.tables import load_frames
-from cleargs.errors import InputError
+from cleargs.errors import InputError, StageError
 from cleargs.media.encode import write_video
 from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
@@ -299,8 +299,11 @@ def test_a_folder_of_videos_is_one_capture(tmp_path: Path, ingest: Ingest) -> No
     assert capture.frames[0].time_s == capture.frames[6].time_s == 0  # each has its own times
     chosen = select_sharp_frames(capture, 64, SilentReporter())
     assert len({frame.name for frame in chosen.frames}) == 9
-    done = ingest(folder, max_frames=12, min_registered=0)
-    assert [frame.name.split("_")[0] for frame in load_frames(done.out)] == ["walk2"] * 8 + ["walk10"] * 4
+    # A clip is a flat picture that moves, so it has no depth and no scene.
+    with pytest.raises(StageError, match="no depth"):
+        ingest(folder, max_frames=12, min_registered=0)
+    twelve = open_capture(folder, IngestConfig(max_frames=12)).frames
+    assert [frame.name.split("_")[0] for frame in twelve] == ["walk2"] * 8 + ["walk10"] * 4
 
 
 def test_videos_of_one_stem_keep_names_of_their_own(tmp_path: Path) -> None:

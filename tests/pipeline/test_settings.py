@@ -123,8 +123,8 @@ def test_run_file_has_the_meaning_of_each_setting(bench: Bench) -> None:
     write_run_file(RunSpec(bench.folder, bench.capture, document, bench.store, "cpu"))
     text = (bench.folder / "run.toml").read_text()
     comment = (
-        "# most frames to take, evenly; in a video, the sharpest nearby "
-        "(a whole number, at least 3; default 150)"
+        "# most frames to take, evenly; in a video, the sharpest nearby, and evenly by the motion of the "
+        "picture if the\n# pace is uneven and fps is unset (a whole number, at least 3; default 150)"
     )
     assert f"{comment}\nmax_frames = 150\n" in text
     assert 'holdout = "every:8"' in text

@@ -14,5 +14,5 @@ def test_page_is_current() -> None:
 
 def test_sections_of_a_docstring_become_markdown() -> None:
     text = section("evaluate_scene")
-    assert "**Args**\n\n* `scene`: A run, a scene or a PLY file. " in text
+    assert "**Args**\n\n* `scene`: A run or its folder, a scene or a PLY file. " in text
     assert "**Example**\n\n```python\n" in text and text.rstrip().endswith("```")
