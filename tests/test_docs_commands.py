@@ -50,6 +50,7 @@ PAGES_NOT_RUN = {
     "docs/developers.md": "changes files of the checkout",
     "docs/gpu.md": "needs a GPU",
     "docs/install.md": "installs packages; make test-package does so",
+    "docs/motion.md": "trains for minutes",
     "docs/speed.md": "measures for minutes",
 }
 """Page with commands that are only parsed -> reason. The experiments need captures and hours."""
