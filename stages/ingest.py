@@ -67,7 +67,7 @@ def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig
     return config.model_copy(update={"max_frames": frames, "max_size": size})
 
 
-VERSION = 20
+VERSION = 21
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}

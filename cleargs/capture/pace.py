@@ -18,6 +18,9 @@ _UNEVEN = {0.5: 0.3, 0.1: 0.05}
 """Share of the mean step between chosen frames -> largest share of shorter steps in an even pace.
 Handheld walks (kitchen, office, terrace) have at most 0.24 and 0.04."""
 
+_SHAKE = 1.5
+"""Largest step that counts, as a factor of the median step of frames that move. A shake is no new view."""
+
 
 class Pace:
     """Adds up the motion of a video's frames, which `add` receives in order."""
@@ -70,6 +73,10 @@ def even_places(distances: ArrayF64, chosen: NDArray[np.intp]) -> NDArray[np.int
     The stretches have the same length by ``distances`` [F]. Returns None if those between the frames
     ``chosen``, which are even in time, are much alike already, or if nothing moves.
     """
+    moves = np.diff(distances, prepend=distances[:1])
+    if moves.any():
+        usual = np.median(moves[moves > 0.1 * moves.mean()])
+        distances = np.cumsum(np.minimum(moves, _SHAKE * usual))
     steps, length = np.diff(distances[chosen]), float(distances[-1])
     even = all((steps < slow * steps.mean()).mean() <= most for slow, most in _UNEVEN.items())
     if len(steps) < 2 or length < 2 * _STEP or even:

@@ -34,7 +34,7 @@ def test_a_rolling_shutter_and_the_motion_of_a_room_are_measured(tmp_path: Path)
     summary = ingested(room, tmp_path / "run")
     row = compare(room, tmp_path / "run").row()
     assert row["frames"] >= 12
-    assert row["left_by_neighbours"] < 0.35 < 0.5 < row["left_by_chosen_frames"]  # observed 0.27, 0.57
+    assert row["left_by_neighbours"] < 0.35 < 0.6 < row["left_by_chosen_frames"]
     true_ms = 1000 * row["readout_true"] / 30
     assert summary["readout_ms"] == pytest.approx(true_ms, rel=0.1)
     low, high = summary["readout_interval_ms"]
