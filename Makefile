@@ -104,9 +104,11 @@ oracles: .oracles/stamp
 
 .oracles/stamp: Makefile
 	npm install --prefix .oracles --ignore-scripts --silent \
-		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 @adobe/spz@0.2.3
-	# Most of the files are maps, debug builds and the GPU drivers of other machines.
-	cd .oracles/node_modules && rm -rf playcanvas/build/playcanvas?* && find . -name '*.map' -delete && find webgpu/dist \
+		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 @adobe/spz@0.2.3 @sparkjsdev/spark@2.2.0 three@0.180.0 fzstd@0.1.1
+	# Most of the files are maps, debug builds, examples and the GPU drivers of other machines.
+	cd .oracles/node_modules && find playcanvas/build/playcanvas?* ! -name playcanvas.min.mjs -delete && \
+		find three/examples -type f ! -name Pass.js -delete && rm -rf three/src @sparkjsdev/spark/dist/*.cjs.* && \
+		find . -name '*.map' -delete && find webgpu/dist \
 		-name '*.node' ! -name "$$(node -p 'process.platform')-$$(node -p 'process.arch').*" -delete
 	touch $@
 
