@@ -8,6 +8,7 @@ from benchmarks.comparison.compare_command import compare
 from benchmarks.comparison.evidence_command import evidence
 from benchmarks.comparison.real_command import real
 from benchmarks.comparison.world_command import world
+from benchmarks.formats_command import formats
 from benchmarks.motion_command import motion
 from benchmarks.native_command import native
 from benchmarks.poses_command import poses
@@ -29,7 +30,20 @@ def rva() -> None:
     """Compare evaluators of frames and check them against ground truth."""
 
 
-for command in (splat, train, formation, quality, compare, evidence, real, world, poses, motion, native):
+for command in (
+    splat,
+    train,
+    formation,
+    quality,
+    compare,
+    evidence,
+    real,
+    world,
+    poses,
+    motion,
+    native,
+    formats,
+):
     benchmarks.add_command(command)
 for command in (agree, check):
     rva.add_command(command)

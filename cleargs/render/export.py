@@ -103,7 +103,11 @@ def export_scene(
         write_json(file, views_json(views, next(iter(cameras.values()))[1], **similarity))
         messages.append(f"{file}: {len(views)} views")
     axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
-    written = _write(scene, dict(zip(outputs, kinds, strict=True)), options, f"scene of {stage}, {axes}")
+    eyes = np.stack([camera.centre for _, camera in cameras.values()])
+    if similarity:
+        eyes = similarity["scale"] * eyes @ similarity["rotation"].T + similarity["translation"]
+    files = dict(zip(outputs, kinds, strict=True))
+    written = _write(scene, files, options, f"scene of {stage}, {axes}", eyes)
     return [*messages, *cropped, *written]
 
 
@@ -177,8 +181,17 @@ def _cropped(scene: Scene, options: ExportOptions) -> tuple[Scene, list[str]]:
     return scene, messages
 
 
-def _write(scene: Scene, outputs: Mapping[Path, str], options: ExportOptions, subject: str) -> list[str]:
-    """Write a scene to each of the ``outputs`` (file -> format). Return messages."""
+def _write(
+    scene: Scene,
+    outputs: Mapping[Path, str],
+    options: ExportOptions,
+    subject: str,
+    eyes: NDArray[np.float64] | None = None,
+) -> list[str]:
+    """Write a scene to each of the ``outputs`` (file -> format), for the camera centres ``eyes`` [M, 3].
+
+    Return messages.
+    """
     messages = []
     if "ply" in outputs.values() and 0 < (degree := scene.gaussians.sh_degree) < 3:
         messages.append(
@@ -188,7 +201,7 @@ def _write(scene: Scene, outputs: Mapping[Path, str], options: ExportOptions, su
         with disk_errors(output):
             output.parent.mkdir(parents=True, exist_ok=True)
         turned = options.up is not None
-        messages += write_scene(output, scene, kind, turned=turned, spz_version=options.spz)
+        messages += write_scene(output, scene, kind, turned=turned, spz_version=options.spz, eyes=eyes)
         messages.append(f"{output}: {subject}, {scene.gaussians.num} Gaussians")
     return messages
 

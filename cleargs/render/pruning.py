@@ -128,11 +128,13 @@ def prune_scene(
     if read_pack(run) is not None:
         return smaller, f"{removed}; a packed run has no images to measure the PSNR"
     with reporter.task("PSNR", 2 * len(views)) as task:
-        before, after = (_psnr(which, views, folder, task.advance) for which in (scene, smaller))
+        before, after = (training_psnr(which, views, folder, task.advance) for which in (scene, smaller))
     return smaller, (f"{removed}; PSNR of {len(views)} training frames {before:.2f} -> {after:.2f} dB")
 
 
-def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, advance: Callable[[], None]) -> float:
+def training_psnr(
+    scene: Scene, views: Sequence[TrainingView], folder: Path, advance: Callable[[], None] = lambda: None
+) -> float:
     """Return the mean PSNR of ``views`` in dB, with the image formation of the stage in ``folder``."""
     exposure = read_exposure(folder / "exposure.parquet")
     formations, _ = read_formation(folder / "formation.parquet")

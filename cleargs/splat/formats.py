@@ -9,11 +9,13 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StoreError
 from cleargs.files import write_bytes
@@ -115,22 +117,33 @@ def check_up(kind: str, up: str | None) -> None:
 
 
 def write_scene(
-    path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: SpzVersion = 3
+    path: Path,
+    scene: Scene,
+    kind: str,
+    *,
+    turned: bool = False,
+    spz_version: SpzVersion = 3,
+    eyes: NDArray[np.float64] | None = None,
 ) -> list[str]:
     """Write a scene atomically in the format ``kind``, as `format_of` returns it. Return what is lost.
 
-    The scene is rotated to the axes of the file unless it is ``turned`` already.
+    The scene is rotated to the axes of the file unless it is ``turned`` already. A .compressed.ply is rounded
+    for cameras with the centres ``eyes`` [M, 3], in the world of the scene.
     """
     target = _format(kind)
     with faults_as(InputError, f"cannot write {path}", hint="remove these Gaussians"):
         scene = replace(scene, gaussians=scene.gaussians.bounded())
     if not turned:
         scene = _turned(scene, target)
+    remarks = target.remarks
     if kind == "spz":
         write_bytes(path, spz(scene, spz_version))
+    elif kind == "compressed.ply":
+        write_bytes(path, compressed_ply(scene, eyes))
+        remarks = partial(compressed_remarks, eyes=eyes)
     else:
         target.write(path, scene)
-    return [f"{path.name}: {remark}" for remark in target.remarks(scene)]
+    return [f"{path.name}: {remark}" for remark in remarks(scene)]
 
 
 def read_scene(path: Path) -> Scene:

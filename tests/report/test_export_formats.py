@@ -23,8 +23,10 @@ from cleargs.formation.observed import Fit
 from cleargs.named_views import keep_views
 from cleargs.render import pruning
 from cleargs.splat.camera import Camera
+from cleargs.splat.compressed_ply import compressed_ply, morton_order
 from cleargs.splat.formats import FORMATS
 from cleargs.splat.ply import read_ply
+from cleargs.splat.transforms import sh_basis
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +142,25 @@ def test_metres(run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[
     for wrong in ("0-999=2", "0=2", "0-1=0"):
         assert export(run, tmp_path / "b.ply", "--metres", wrong) == 2
         assert "FRAME-FRAME=METRES" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [["--up", "y", "--metres", "0-5=30"], ["--world", "input"]])
+def test_a_compressed_ply_is_rounded_for_the_cameras(
+    run: FinishedRun, options: list[str], tmp_path: Path
+) -> None:
+    assert export(run, tmp_path / "a.ply", *options) == 0
+    assert export(run, tmp_path / "b.compressed.ply", *options) == 0
+    scene, back = read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.compressed.ply").gaussians.sh
+    (tmp_path / "c.compressed.ply").write_bytes(compressed_ply(scene))  # for no cameras
+    plain = read_ply(tmp_path / "c.compressed.ply").gaussians.sh
+    cameras = json.loads((tmp_path / "a.cameras.json").read_text())
+    eyes = torch.tensor([camera["position"] for camera in cameras], dtype=torch.float64)
+    made = scene.gaussians.select(torch.from_numpy(morton_order(scene.gaussians.means.numpy())))
+    basis = sh_basis(torch.nn.functional.normalize(made.means[:, None] - eyes, dim=2), made.sh.shape[1])
+    errors = [
+        torch.einsum("nmk,nkc->nmc", basis, (sh - made.sh).double()).square().mean() for sh in (back, plain)
+    ]
+    assert errors[0] < 0.2 * errors[1]
 
 
 def test_an_unknown_ending_writes_nothing(

@@ -10,7 +10,9 @@ import torch
 
 from cleargs.splat.compressed_ply import compressed_ply, morton_order
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.transforms import sh_basis
 
 gsply = pytest.importorskip("gsply")
 
@@ -53,6 +55,27 @@ def test_bytes_do_not_depend_on_the_order_of_gaussians() -> None:
     made = make(700, 1)
     shuffled = made.select(torch.randperm(700, generator=torch.Generator().manual_seed(0)))
     assert compressed_ply(Scene(made)) == compressed_ply(Scene(shuffled))
+
+
+def test_harmonics_are_rounded_for_the_cameras(tmp_path: Path) -> None:
+    """Rounded one by one, they cost a trained scene of degree 3 0.31 dB; rounded for its cameras, 0.02 dB."""
+    made = make(1000, 3)
+    made.sh.mul_(0.1)
+    chance = np.random.default_rng(5)
+    eyes, others = chance.normal([0, 0, -9], 1.0, (12, 3)), chance.normal([0, 0, -9], 1.0, (12, 3))
+    errors = []
+    for given in (None, eyes):
+        (tmp_path / "a.compressed.ply").write_bytes(compressed_ply(Scene(made), given))
+        back = read_ply(tmp_path / "a.compressed.ply").gaussians.sh
+        for seen in (others, -others):
+            directions = torch.nn.functional.normalize(made.means[:, None] - torch.from_numpy(seen), dim=2)
+            basis = sh_basis(directions, 16)
+            order = torch.from_numpy(morton_order(made.means.numpy()))
+            change = (back - made.sh[order]).double()
+            errors.append(float(torch.einsum("nmk,nkc->nmc", basis[order], change).square().mean() ** 0.5))
+    alone, alone_behind, fitted, fitted_behind = errors
+    # Observed: 0.0099 -> 0.0024 from the side of the cameras; 0.0098 -> 0.0142 from the other side.
+    assert fitted < 0.4 * alone and fitted_behind < 2.0 * alone_behind
 
 
 def test_neighbours_in_the_file_are_neighbours_in_space() -> None:
