@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +56,37 @@ def scene_path(run: Path, stage: str) -> Path:
     """Return the path of the scene of a stage, which need not exist. A packed run has its one at the top."""
     packed = read_pack(run)
     return run / SCENE if packed is not None and packed.scene == stage else run / stage / SCENE
+
+
+def edited_scene(run: Path, stage: str, file: Path) -> Scene:
+    """Read an edited copy of the scene of ``stage``, and give it the scene's anti-aliasing and background.
+
+    Raises InputError if most of its Gaussians are at other places than those of the scene, and StoreError if
+    a file cannot be read.
+    """
+    import numpy as np
+    from scipy.spatial import KDTree
+
+    from cleargs.splat.formats import read_scene
+    from cleargs.splat.ply import read_ply
+
+    own, edited = read_ply(scene_path(run, stage)), read_scene(file)
+    places, own_places = edited.gaussians.means.numpy(), own.gaussians.means.numpy()
+    if not len(places) or not len(own_places):
+        raise InputError(f"{file} or the scene of {stage} has no Gaussians", hint="choose another file")
+    reach = float(np.ptp(np.percentile(own_places, [1, 99], axis=0), axis=0).max())
+    some = places[:: -(-len(places) // _COMPARED)]
+    share = float((KDTree(own_places).query(some)[0] <= _SAME_PLACE * reach).mean())
+    if share < 0.5:
+        raise InputError(
+            f"{file} is not where the scene of {run} is: {share:.0%} of its Gaussians are at a place of it",
+            hint=f"edit the file of `cleargs export {run} -o edit.ply`, and keep its axes and size",
+        )
+    return replace(edited, antialias=own.antialias, background=own.background)
+
+
+_COMPARED = 10_000  # Gaussians, at most
+_SAME_PLACE = 1e-3  # share of the size of the scene; .compressed.ply moves Gaussians by less
 
 
 def open_run(folder: str | Path) -> Run:

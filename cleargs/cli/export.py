@@ -8,7 +8,15 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import FILE, answer, json_option, quiet_option, scene_argument, scene_option
+from cleargs.cli.common import (
+    FILE,
+    answer,
+    edited_option,
+    json_option,
+    quiet_option,
+    scene_argument,
+    scene_option,
+)
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
@@ -27,6 +35,7 @@ Examples:
   cleargs export room -o room.ply --world input    in the world of the capture's poses
   cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
   cleargs export room -o room.ply --drop sphere:0.2,-1,3,0.1   without a floater
+  cleargs export room -o room.sog --scene edited.ply   a copy from which an editor cut floaters
   cleargs export other.spz -o other.ply            a scene file of any program
   cleargs export room --capture room-data          frames and poses for nerfstudio, gsplat, Brush
 
@@ -96,6 +105,7 @@ Programs of --for:
     help="Version of an .spz: 4 for PlayCanvas, 3 for all others.  [default: 3]",
 )
 @scene_option
+@edited_option
 @click.option(
     "--for",
     "program",

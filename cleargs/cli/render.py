@@ -10,6 +10,7 @@ import click
 from cleargs.cli.common import (
     FILE,
     answer,
+    edited_option,
     json_option,
     parse_size,
     quiet_option,
@@ -33,6 +34,7 @@ Examples:
   cleargs render room -o still.png --frame 12           at the pose of frame 12
   cleargs render room -o still.exr --frame 12           scene-linear RGB, alpha and depth
   cleargs render room -o shots/%04d.exr --poses shots.json
+  cleargs render room -o room.mp4 --scene edited.ply    an edited copy of the scene
   cleargs render other.spz -o %04d.png --poses shots.json   a scene file of any program
 
 \b
@@ -64,6 +66,7 @@ renders a picture for each pose.
     "[default: normalised for cameras.json, input for transforms.json]",
 )
 @scene_option
+@edited_option
 @click.option(
     "--size", callback=parse_size, metavar="WxH", help="Size of a picture.  [default: size of the frames]"
 )

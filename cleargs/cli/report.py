@@ -14,6 +14,7 @@ import click
 from cleargs.cli.common import (
     FILE,
     answer,
+    edited_option,
     json_option,
     open_option,
     quiet_option,
@@ -40,6 +41,7 @@ Examples:
   cleargs report room                           room/report.html, which opens in any browser, also offline
   cleargs report room --single-file             one file to send: room/room-report.html
   cleargs report room --single-file -o a.html   the same under another name
+  cleargs report room --scene edited.ply        with an edited copy of the scene
 """
 )
 @run_argument
@@ -55,6 +57,7 @@ Examples:
     help="Keep a view of the scene (position, target) in RUN, for the report and `export --for web`. "
     "The page prints this option. `start` is the first view; NAME= removes one.",
 )
+@edited_option
 @open_option("Open the report in the browser.")
 @threads_option
 @store_option
@@ -67,6 +70,7 @@ def report(
     single_file: bool,
     output: Path | None,
     views: tuple[str, ...],
+    scene: Path | None,
     opens: bool,
     threads: int,
     store: Path | None,
@@ -92,12 +96,12 @@ def report(
         require_images(run, "a report with other views")
         keep_views(settings.folder, views)
     page = page_of(settings.folder)
-    if read_pack(run) and page.is_file():
+    if read_pack(run) and page.is_file() and scene is None:
         click.echo("note: this is the report as it was packed; without images no other is possible", err=True)
     else:
         require_images(run, "a report")
         with opened_store(settings.store) as opened:
-            write_report(Planner(dag, settings, opened, threads, make_reporter(quiet)))
+            write_report(Planner(dag, settings, opened, threads, make_reporter(quiet)), scene)
     address = (settings.folder / ENTRY).as_uri()
     facts: dict[str, Any] = {"report": str(page)}
     lines = [f"report: {address}"]

@@ -26,7 +26,7 @@ from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
-from cleargs.run_results import scene_path
+from cleargs.run_results import edited_scene, scene_path
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
 from cleargs.splat.ply import read_ply
@@ -59,6 +59,8 @@ class ExportOptions:
     """Version of .spz files."""
     views: bool = False
     """Write the named views of the run, if it has some, next to the first file."""
+    scene: Path | None = None
+    """An edited copy of the run's scene, in its place."""
 
 
 def export_scene(
@@ -72,12 +74,15 @@ def export_scene(
     if (options.up or options.upright) is not None and options.world == "input":
         raise InputError("--up and --upright exclude --world input", hint="give one of them")
     thresholds = parse_prune(options.prune)
-    check_outputs(outputs, installed(), run, force=options.force)
+    edited = () if options.scene is None else (options.scene,)
+    check_outputs(outputs, installed(), run, inputs=edited, force=options.force)
     ingest = run / "ingest"
     posed = [frame for frame in load_frames(ingest) if frame.registered]
     cameras = {frame.frame_id: (frame.name, camera_of(frame)) for frame in posed}
     similarity = _similarity(ingest, cameras, options)
-    scene, messages = read_ply(scene_path(run, stage)), []
+    scene, messages = read_ply(scene_path(run, stage)), list[str]()
+    if options.scene is not None:
+        scene = edited_scene(run, stage, options.scene)
     if thresholds:
         scene, message = prune_scene(scene, thresholds, run, stage, reporter)
         messages.append(message)
@@ -107,7 +112,8 @@ def export_scene(
     if similarity:
         eyes = similarity["scale"] * eyes @ similarity["rotation"].T + similarity["translation"]
     files = dict(zip(outputs, kinds, strict=True))
-    written = _write(scene, files, options, f"scene of {stage}, {axes}", eyes)
+    source = f"scene of {stage}" if options.scene is None else str(options.scene)
+    written = _write(scene, files, options, f"{source}, {axes}", eyes)
     return [*messages, *cropped, *written]
 
 
@@ -117,9 +123,9 @@ def export_file(file: Path, outputs: Sequence[Path], options: ExportOptions) -> 
     Raises InputError for options that need a run, and StoreError if the file cannot be read.
     """
     kinds = _kinds(outputs, options)
-    if options.world == "input" or options.metres or options.prune or options.cameras:
+    if options.world == "input" or options.metres or options.prune or options.cameras or options.scene:
         raise InputError(
-            "--world, --metres, --prune and --cameras need the cameras of a run",
+            "--world, --metres, --prune, --cameras and --scene need the cameras of a run",
             hint="leave them out for a file",
         )
     check_outputs(outputs, installed(), inputs=[file], force=options.force)

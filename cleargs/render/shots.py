@@ -23,7 +23,7 @@ from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
 from cleargs.render.output import Kind, Shot, kind_of, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
-from cleargs.run_results import scene_path
+from cleargs.run_results import edited_scene, scene_path
 from cleargs.safe_io import FAULTS, cause, read_json
 from cleargs.splat.camera import Camera
 from cleargs.splat.formats import read_scene
@@ -59,6 +59,8 @@ class ShotOptions:
     """World of `poses`."""
     size: Size | None = None
     """Width and height, px."""
+    scene: Path | None = None
+    """An edited copy of the run's scene, in its place."""
     fps: float = 30.0
     seconds: float | None = None
     side_by_side: bool = False
@@ -106,8 +108,10 @@ def render_run(
     kind = kind_of(output)
     if kind == "folder" and output.parent.exists():  # it may contain other files than stills
         raise InputError(f"{output.parent} exists already", hint="choose a new folder")
-    inputs = () if options.poses is None else (options.poses,)
+    inputs = [path for path in (options.poses, options.scene) if path is not None]
     if run.is_file():
+        if options.scene is not None:
+            raise InputError("--scene is an edited scene of a run", hint="give the run, or leave out --scene")
         check_outputs([output], installed(), inputs=(run, *inputs), force=force)
         if options.poses is None:
             raise InputError(f"{run} has no cameras", hint="give --poses FILE.json, or a run")
@@ -120,7 +124,7 @@ def render_run(
             require_images(run, "--side-by-side")
         shots, file = _shots(run / "ingest", options, kind), scene_path(run, stage)
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
-        scene = read_scene(file)
+        scene = read_scene(file) if options.scene is None else edited_scene(run, stage, options.scene)
         write_shots(output, scene, shots, task, fps=options.fps, codec=options.codec, device=device)
     return shots
 

@@ -51,9 +51,11 @@ from cleargs.report.report_json import (
 )
 from cleargs.report.single_file import single_file_size
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
+from cleargs.run_results import edited_scene
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.render import Viewer
+from cleargs.splat.scene import Scene
 from cleargs.splat.tables import TRAIN
 
 _STILL = 960  # long side of the image that is shown until the 3D viewer has loaded, px
@@ -87,11 +89,12 @@ def page_environment() -> Environment:
     return environment
 
 
-def write_report(planner: Planner) -> Path:
+def write_report(planner: Planner, edited: Path | None = None) -> Path:
     """Write the report of a run atomically, in place of an older one. Return the path of its page.
 
-    Raises InputError if no stage of the run is finished, and StoreError if a result is damaged or the report
-    cannot be written.
+    It shows the last scene of the run, or the file ``edited``, an edited copy of it. Raises InputError
+    if no stage of the run is finished or the copy has another place, and StoreError if a result is damaged or
+    the report cannot be written.
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
@@ -110,12 +113,16 @@ def write_report(planner: Planner) -> Path:
     versions: dict[str, str] = {}
     for manifest in manifests.values():
         versions |= {**manifest.versions, **manifest.parts.libraries}
+    changed = edited_scene(run, trained[-1], edited) if edited and trained else None
     with whole_folder(page_of(run).parent, replace=True) as folder:
         scene, final, viewer = None, None, ""
         if trained and placed:
-            scene, final = _write_scene(folder, run, trained[-1], placed)
+            scene, final = _write_scene(folder, run, trained[-1], placed, changed)
+            scene["edited"] = edited.name if edited else ""
             viewer = write_viewer(folder)
         models = scene_with_models(rows, run, manifests)
+        if models and changed:
+            models.scene = changed
         pictures = write_pictures(rows, run, folder, final, models, planner.threads)
         settings, times = viewer_data(placed, scene, read_views(run)) if scene else (None, {})
         frames = [
@@ -165,12 +172,16 @@ def write_report(planner: Planner) -> Path:
 
 
 def _write_scene(
-    folder: Path, run: Path, stage: str, placed: Sequence[FrameRow]
+    folder: Path, run: Path, stage: str, placed: Sequence[FrameRow], edited: Scene | None
 ) -> tuple[dict[str, Any], Viewer]:
-    """Write the last scene, with a still. Return its data for the template, and its renderer."""
+    """Write the last scene or its ``edited`` copy, with a still.
+
+    Return its data for the template, and its renderer.
+    """
     camera = camera_of(opening_frame(placed).frame)
     still = camera.scaled(_STILL / max(camera.width, camera.height))
-    scene = read_ply(run / stage / "scene.ply")
+    file = run / stage / "scene.ply"
+    scene = edited or read_ply(file)
     renderer = Viewer(scene)
     data = {
         "gaussians": scene.gaussians.num,
@@ -180,7 +191,7 @@ def _write_scene(
         "antialias": scene.antialias,
         "background": scene.background,
         "file": f"../{stage}/scene.ply",
-        "bytes": (run / stage / "scene.ply").stat().st_size,
+        "bytes": file.stat().st_size,
     }
     return data, renderer
 
