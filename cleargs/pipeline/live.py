@@ -80,10 +80,27 @@ def stage_at_work(run: Path, store: Path, *, stopped: bool = False) -> tuple[str
         return None
     if not stopped and writer_is_alive(work):
         return found.stage, f"running: {found.words}, for {max(0.0, time.time() - found.begun):.0f} s"
-    nodes = nodes_below(work / "checkpoints")
-    saved = any(node.name != PREVIEW and node.is_file(follow_symlinks=False) for node in nodes)
-    kept = "continues from its last checkpoint" if saved else "has no checkpoint yet"
-    return found.stage, f"stopped at {found.words}; {kept}"
+    nodes = [
+        node
+        for node in nodes_below(work / "checkpoints")
+        if node.name != PREVIEW and node.is_file(follow_symlinks=False)
+    ]
+    kept = "no checkpoint yet"
+    if nodes:
+        step = _step_of(max(nodes, key=lambda node: node.stat().st_mtime_ns).path)
+        kept = "continues from its last checkpoint" if step is None else f"checkpoint at {step}"
+    return found.stage, f"interrupted at {found.words}; {kept}"
+
+
+def _step_of(checkpoint: str) -> int | None:
+    """Return the step of a checkpoint of a training; None for other files."""
+    from safetensors import SafetensorError, safe_open  # takes 0.1 s to load
+
+    try:
+        with safe_open(checkpoint, "numpy") as tensors:
+            return int(tensors.get_tensor("step"))
+    except (OSError, SafetensorError, ValueError, TypeError):
+        return None
 
 
 class Preview(NamedTuple):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from test_interruption import start, wait_for
 from toy import Bench
 
@@ -22,6 +23,7 @@ from cleargs.pipeline.live import (
     stage_at_work,
 )
 from cleargs.progress import COMPILING, LineReporter, SilentReporter
+from cleargs.splat.state import save_state
 
 
 def test_an_active_run_is_visible_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,10 +61,10 @@ def test_a_killed_run_is_not_active(bench: Bench, capsys: pytest.CaptureFixture[
     assert (bench.folder / PROGRESS_FILE).exists() and running_stage(bench.folder, bench.store) is None
     assert stage_at_work(bench.folder, bench.store) == (
         "square",
-        "stopped at square; continues from its last checkpoint",
+        "interrupted at square; continues from its last checkpoint",
     )
     assert invoke(["status", str(bench.folder)], bench.dag) == 0
-    assert "stopped at square; continues from its last checkpoint" in capsys.readouterr().out
+    assert "interrupted at square; continues from its last checkpoint" in capsys.readouterr().out
     hold.unlink()
     assert [outcome.how for outcome in bench.run()] == ["found", "made", "made"]
     assert not (bench.folder / PROGRESS_FILE).exists()
@@ -150,7 +152,8 @@ def test_the_progress_file_is_not_in_the_work_folder(bench: Bench) -> None:
 def test_an_interrupted_task_stays_visible(tmp_path: Path) -> None:
     work = tmp_path / "store" / "work" / "key"
     (work / "checkpoints").mkdir(parents=True)
-    (work / "checkpoints" / "g0.safetensors").touch()
+    checkpoint = work / "checkpoints" / "g0.safetensors"
+    checkpoint.touch()  # a damaged one
     lines: list[str] = []
     reporter = LineReporter(lines.append, lines.append, lambda line: None)
     with (
@@ -160,5 +163,14 @@ def test_an_interrupted_task_stays_visible(tmp_path: Path) -> None:
     ):
         task.update(done=130, note="24.1 dB")
         raise KeyboardInterrupt
-    assert lines == ["g0: stopped at G0, 130 of 800, 24.1 dB; continues from its last checkpoint"]
+    assert lines == ["g0: interrupted at G0, 130 of 800, 24.1 dB; continues from its last checkpoint"]
     assert stage_at_work(tmp_path, tmp_path / "store") == tuple(lines[0].split(": ", 1))
+    for write, said in (
+        (lambda: save_state(checkpoint, {"step": torch.tensor(100)}), "checkpoint at 100"),
+        (checkpoint.unlink, "no checkpoint yet"),
+    ):
+        write()
+        assert stage_at_work(tmp_path, tmp_path / "store") == (
+            "g0",
+            f"interrupted at G0, 130 of 800, 24.1 dB; {said}",
+        )
