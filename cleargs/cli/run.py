@@ -267,10 +267,12 @@ def stage(context: click.Context, /, name: str, run: Path, force: bool, **option
 @click.command(
     epilog="""\b
 States:
-  done     all results exist
-  partial  some results are missing; the next run retries them
-  missing  no results for the current settings and inputs; the line shows what changed
-  packed   results in a run of `cleargs pack`, which cannot be continued
+  done      all results exist
+  partial   some results are missing; the next run retries them
+  outdated  results exist, of other settings, inputs or libraries; the line shows what changed. They can be
+            used; the next run makes new ones
+  missing   no results
+  packed    results in a run of `cleargs pack`, which cannot be continued
 """
 )
 @run_argument
@@ -278,7 +280,7 @@ States:
 @json_option
 @click.pass_obj
 def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
-    """Show for each stage of RUN if it is done, partial or missing, and what changed."""
+    """Show for each stage of RUN if it is done, outdated or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
     if packed := read_pack(settings.folder):
         kept = Counter(file.partition("/")[0] for file in packed.files)
@@ -298,6 +300,11 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
         return
     with opened_store(settings.store) as opened:
         plans = Planner(dag, settings, opened, usable_cores(), make_reporter()).plan()
+    shown = linked_manifests(settings.folder, dag.names)
+    plans = [
+        replace(plan, state="outdated") if plan.state == "missing" and plan.stage in shown else plan
+        for plan in plans
+    ]
     if at_work := stage_at_work(settings.folder, settings.store):
         name, text = at_work
         plans = [replace(plan, reasons=(text,)) if plan.stage == name else plan for plan in plans]
