@@ -8,7 +8,7 @@ COLMAP project by name, and hold out those whose place is a multiple of ``--test
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from cleargs.capture.model import read_model, write_model
 from cleargs.capture.tables import Frame, Points
 from cleargs.files import whole_folder, write_bytes, write_json
-from cleargs.media.image import write_mask
+from cleargs.media.image import to_uint8, write_mask, write_rgb
 from cleargs.packed import require_images
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
@@ -34,6 +34,8 @@ def write_handover(
     cameras: Mapping[int, Camera],
     target: Path,
     weights: Mapping[int, float] | None,
+    repeat: int = 1,
+    sharper: Callable[[int], Any] | None = None,
 ) -> Path:
     """Write a capture into the new folder ``target`` (`cleargs.run_results.Prepared.to_nerfstudio`)."""
     run = ingest.parent
@@ -45,6 +47,7 @@ def write_handover(
         for frame in frames
         if frame.registered and (frame.split == "test" or known.get(frame.frame_id, 0.0) > 0)
     ]
+    used, origin = _repeated(used, known, repeat)
     every, order, extra = gsplat_order(used)
     names = {frame.frame_id: Path(frame.image).name for frame in used}
     if every is not None and [frame.frame_id for frame in order] != _by_name(used):
@@ -56,8 +59,14 @@ def write_handover(
         if masked:
             (made / "masks").mkdir()
         for frame in used:
-            camera, name = cameras[frame.frame_id], names[frame.frame_id]
-            shutil.copyfile(ingest / frame.image, made / "images" / name)
+            camera, name = cameras[origin[frame.frame_id].frame_id], names[frame.frame_id]
+            image = None
+            if sharper is not None and frame.split == "train":
+                image = sharper(origin[frame.frame_id].frame_id)
+            if image is not None:
+                write_rgb(made / "images" / name, to_uint8(image.image))
+            else:
+                shutil.copyfile(ingest / origin[frame.frame_id].image, made / "images" / name)
             pose = np.linalg.inv(camera.world_to_camera) * [1.0, -1.0, -1.0, 1.0]  # OpenGL axes
             entry: dict[str, Any] = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
             entry |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
@@ -72,17 +81,40 @@ def write_handover(
         document = {"camera_model": "PINHOLE", "ply_file_path": POINTS, **split, "frames": entries}
         write_json(made / "transforms.json", document)
         write_points(made / POINTS, points)
-        _write_model(ingest, points, made / "sparse/0", names, {frame.frame_id for frame in extra})
+        without = {frame.frame_id for frame in extra}
+        listed = {frame_id: name for frame_id, name in names.items() if frame_id not in without}
+        _write_model(ingest, points, made / "sparse/0", listed, origin)
         facts = {
             "train": train,
             "test": test,
             "test_every": every,
             "not_in_sparse": [files[frame.frame_id] for frame in extra],
             "names": {files[frame.frame_id]: frame.name for frame in used},
-            "weights": {files[f.frame_id]: known[f.frame_id] for f in used if f.split == "train"},
+            "weights": {
+                files[f.frame_id]: known[origin[f.frame_id].frame_id] for f in used if f.split == "train"
+            },
         }
         write_json(made / SPLIT, facts)
     return target
+
+
+def _repeated(
+    frames: Sequence[Frame], weights: Mapping[int, float], repeat: int
+) -> tuple[list[Frame], dict[int, Frame]]:
+    """Repeat each training frame ``repeat`` times its weight, rounded, and at least once.
+
+    Copies have another frame_id and image. The second value is frame_id -> the frame that was copied.
+    """
+    found, origin = [], {frame.frame_id: frame for frame in frames}
+    for frame in frames:
+        found.append(frame)
+        times = round(repeat * weights[frame.frame_id]) if frame.split == "train" and repeat > 1 else 1
+        for number in range(2, times + 1):
+            image = Path(frame.image)
+            name = image.with_name(f"{image.stem}-{number}{image.suffix}").as_posix()
+            found.append(replace(frame, frame_id=max(origin) + 1, image=name))
+            origin[found[-1].frame_id] = frame
+    return found, origin
 
 
 def gsplat_order(frames: Sequence[Frame]) -> tuple[int | None, list[Frame], list[Frame]]:
@@ -118,14 +150,12 @@ def _write_mask(folder: Path, frame: Frame, target: Path) -> None:
 
 
 def _write_model(
-    ingest: Path, points: Points, folder: Path, names: Mapping[int, str], without: set[int]
+    ingest: Path, points: Points, folder: Path, names: Mapping[int, str], origin: Mapping[int, Frame]
 ) -> None:
     """Write the COLMAP model of ingest with the new names of its images, which have frame_id + 1 as id."""
     model = read_model(ingest / "colmap/sparse/0")
     images = {
-        key: replace(image, name=names[key - 1])
-        for key, image in model.images.items()
-        if key - 1 in names and key - 1 not in without
+        key + 1: replace(model.images[origin[key].frame_id + 1], name=name) for key, name in names.items()
     }
     write_model(folder, replace(model, images=images), points.rgb)
 

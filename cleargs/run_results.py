@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from cleargs.capture.tables import Frame, Points
+    from cleargs.rivr.distillation import Deblurred
     from cleargs.splat.camera import Camera
     from cleargs.splat.scene import Scene
     from cleargs.splat.views import TrainingView, ViewDataset
@@ -225,7 +226,14 @@ class Prepared:
 
         return ViewDataset(self.views(weights))
 
-    def to_nerfstudio(self, folder: str | Path, weights: Mapping[int, float] | None = None) -> Path:
+    def to_nerfstudio(
+        self,
+        folder: str | Path,
+        weights: Mapping[int, float] | None = None,
+        *,
+        repeat: int = 1,
+        sharper: Callable[[int], Deblurred | None] | None = None,
+    ) -> Path:
         """Write the capture into a new folder, for nerfstudio, gsplat and other trainers of COLMAP projects.
 
         The folder has ``transforms.json`` with the split and the sparse points, for nerfstudio; a COLMAP
@@ -237,6 +245,10 @@ class Prepared:
             folder: The new folder.
             weights: frame_id -> weight, such as ``run["rva"].weights()``. Training frames of weight 0 are
                 left out.
+            repeat: For trainers that know no weights: a training frame of weight w is written
+                ``repeat * w`` times, rounded, and at least once.
+            sharper: Function of a frame_id that returns the image to write in place of a training frame as
+                filmed, or None: ``functools.partial(cg.deblur, run)``.
 
         Raises:
             InputError: if the folder is in the input, or the run is packed.
@@ -248,7 +260,10 @@ class Prepared:
         """
         from cleargs.handover import write_handover
 
-        return write_handover(self.folder, self.frames, self.points, self.cameras(), Path(folder), weights)
+        cameras, target = self.cameras(), Path(folder)
+        return write_handover(
+            self.folder, self.frames, self.points, cameras, target, weights, repeat, sharper
+        )
 
     def views(self, weights: Mapping[int, float] | None = None) -> list[TrainingView]:
         """Return the views of a training: the frames with a pose that are not held out.

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import json
 import re
 import runpy
+import shutil
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -18,6 +22,7 @@ import torch
 from plyfile import PlyData
 
 import cleargs as cg
+from cleargs.cli.main import invoke
 from cleargs.errors import CleargsError
 from cleargs.handover import gsplat_order
 from cleargs.progress import SilentReporter
@@ -164,6 +169,39 @@ def test_other_trainers_hold_out_the_same_frames(place: Path, tmp_path: Path) ->
     assert not facts["not_in_sparse"] and len(model.points3D) == len(capture.points.xyz)
 
 
+def test_frames_repeat_by_their_weights_for_trainers_that_know_none(place: Path, tmp_path: Path) -> None:
+    capture = cg.open_prepared(cg.open_run(place / "run")["ingest"])
+    frames = [replace(f, split="test" if f.frame_id == 2 else "train") for f in capture.frames]
+    weights = {frame.frame_id: 0.25 * (frame.frame_id % 4 + 1) for frame in frames}
+    made = replace(capture, frames=frames).to_nerfstudio(tmp_path / "data", weights, repeat=4)
+    meta, facts = (json.loads((made / name).read_text()) for name in ("transforms.json", "split.json"))
+    times = [list(facts["names"].values()).count(frame.name) for frame in frames]
+    assert times == [1, 2, 1, 4, 1, 2, 3, 4], "a held-out frame is not repeated"
+    assert len(meta["train_filenames"]) == 17 and len(meta["test_filenames"]) == 1
+    model = pycolmap.Reconstruction(str(made / "sparse/0"))
+    names = sorted(image.name for image in model.images.values())
+    assert names == sorted(path.name for path in (made / "images").iterdir()) and len(names) == 18
+    assert [f"images/{name}" for name in names[:: facts["test_every"]]] == meta["test_filenames"]
+    poses = {entry["file_path"]: entry["transform_matrix"] for entry in meta["frames"]}
+    same = [file for file, name in facts["names"].items() if name == frames[3].name]
+    assert all(poses[file] == poses[same[0]] for file in same)
+
+
+def test_frames_can_be_deblurred_for_other_trainers(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, made = place / "run", [str(tmp_path / "a"), str(tmp_path / "b")]
+    assert invoke(["export", str(run), "--capture", made[0]]) == 0
+    assert invoke(["export", str(run), "--capture", made[1], "--deblurred", "--repeat", "2"]) == 0
+    facts = json.loads(Path(made[1], "split.json").read_text())
+    deblurred = [name for name in facts["names"] if not name.endswith("-2.png")]
+    found = {name: cg.deblur(cg.open_run(run), k) for k, name in enumerate(deblurred)}
+    changed = [Path(made[0], name).read_bytes() != Path(made[1], name).read_bytes() for name in deblurred]
+    assert changed == [image is not None for image in found.values()]
+    assert invoke(["export", str(run), "-o", str(tmp_path / "x.ply"), "--deblurred"]) == 2
+    assert "--capture" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("held", ["10000000" * 4, "0100100", "0111000000", "1010101011", "000"])
 def test_every_nth_image_is_one_that_was_held_out(held: str, place: Path) -> None:
     some = cg.open_prepared(cg.open_run(place / "run")["ingest"]).frames[0]
@@ -178,6 +216,79 @@ def test_every_nth_image_is_one_that_was_held_out(held: str, place: Path) -> Non
         assert len(extra) <= held.count("1") // 2 and all(f.split == "test" for f in extra)
     if held.startswith("1000"):
         assert every == 8 and order == frames
+
+
+@pytest.fixture
+def lichtfeld(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """The parts of LichtFeld Studio's module that its page "Plugin Developer Guide" describes."""
+    loaded: list[tuple[str, bool]] = []
+    module = SimpleNamespace(
+        classes=[],
+        loaded=loaded,
+        ui=SimpleNamespace(Panel=object, PanelSpace=SimpleNamespace(MAIN_PANEL_TAB=3)),
+        log=SimpleNamespace(info=lambda text: None),
+        load_file=lambda path, is_dataset=False: loaded.append((path, is_dataset)),
+    )
+    module.register_class, module.unregister_class = module.classes.append, module.classes.remove
+    monkeypatch.setitem(sys.modules, "lichtfeld", module)  # type: ignore[arg-type]
+    monkeypatch.syspath_prepend(EXAMPLES / "lichtfeld")
+    return module
+
+
+class DrawnPanel:
+    """LichtFeld's ``ui``, with a user who types a path and presses the button ``pressed``."""
+
+    def __init__(self, source: Path | str, pressed: str = "") -> None:
+        self.source, self.pressed, self.texts = str(source), pressed, list[str]()
+
+    def input_text(self, label: str, value: str) -> tuple[bool, str]:
+        return False, str(Path(sys.executable).with_name("cleargs"))
+
+    def path_input(self, label: str, value: str, folder_mode: bool = True) -> tuple[bool, str]:
+        return True, self.source
+
+    def slider_int(self, label: str, value: int, low: int, high: int) -> tuple[bool, int]:
+        return True, 2
+
+    def checkbox(self, label: str, value: bool) -> tuple[bool, bool]:
+        return False, value
+
+    def button(self, label: str) -> bool:
+        return label == self.pressed
+
+    def button_styled(self, label: str, style: str) -> bool:
+        return label == self.pressed
+
+    def text_wrapped(self, text: str) -> None:
+        self.texts.append(text)
+
+    text_disabled = text_wrapped
+
+
+def test_the_plugin_of_lichtfeld_opens_the_frames_of_a_run(
+    place: Path, tmp_path: Path, lichtfeld: SimpleNamespace
+) -> None:
+    """With a stand-in for LichtFeld's module, since the program needs an NVIDIA GPU."""
+    plugin = importlib.import_module("cleargs_frames")
+    manifest = tomllib.loads((EXAMPLES / "lichtfeld/cleargs_frames/pyproject.toml").read_text())
+    assert {"name", "version", "description"} <= manifest["project"].keys()
+    required = {"hot_reload", "plugin_api", "lichtfeld_version", "required_features"}
+    assert manifest["tool"]["lichtfeld"].keys() == required
+    plugin.on_load()
+    panel = lichtfeld.classes[0]()
+    shutil.copytree(place / "run", tmp_path / "run", symlinks=True)
+    panel.draw(DrawnPanel(tmp_path / "run", "Prepare and open"))
+    panel._job.join()
+    panel.draw(DrawnPanel(tmp_path / "run"))
+    data = tmp_path / "run-data"
+    assert lichtfeld.loaded == [(str(data), True)]
+    assert (data / "sparse/0/images.bin").is_file() and len(list((data / "images").iterdir())) > 8
+    panel.draw(ui := DrawnPanel(tmp_path / "nothing.mp4", "Prepare and open"))
+    panel._job.join()
+    panel.draw(ui := DrawnPanel(tmp_path / "nothing.mp4"))
+    assert any("nothing.mp4" in text and "hint:" in text for text in ui.texts)
+    plugin.on_unload()
+    assert lichtfeld.classes == []
 
 
 def test_a_capture_as_a_dataset(place: Path) -> None:

@@ -19,7 +19,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
-from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.dag import Dag, installed
 from cleargs.render import TARGETS
 from cleargs.run_results import scene_stage
 
@@ -135,6 +135,18 @@ Programs of --for:
     help="Write the capture in place of the scene: frames, poses, points and split for nerfstudio, gsplat, "
     "Brush and other trainers. Frames to which RVA gives no weight are left out.",
 )
+@click.option(
+    "--repeat",
+    type=click.IntRange(1, 20),
+    default=1,
+    help="With --capture: write a training frame of weight w this number times w (rounded, at least once), "
+    "for trainers that know no weights.  [default: 1]",
+)
+@click.option(
+    "--deblurred",
+    is_flag=True,
+    help="With --capture: undo the motion, rolling shutter and defocus of training frames. Needs a scene.",
+)
 @click.option("--force", is_flag=True, help="Replace existing files.")
 @json_option
 @quiet_option
@@ -149,6 +161,8 @@ def export(
     as_json: bool,
     quiet: bool,
     capture: Path | None,
+    repeat: int,
+    deblurred: bool,
     **options: Any,
 ) -> None:
     """Write the scene of RUN, or a scene file of any program, to one or several files."""
@@ -157,8 +171,10 @@ def export(
     if capture is not None:
         if outputs or program:
             raise InputError("--capture writes no scene", hint="give it without -o and --for")
-        _export_capture(run, capture, as_json)
+        _export_capture(run, capture, repeat, deblurred, as_json)
         return
+    if repeat > 1 or deblurred:
+        raise InputError("--repeat and --deblurred are for --capture FOLDER", hint="leave them out")
     target = TARGETS[program] if program is not None else None
     if target is not None:
         name = run.resolve().name if run.is_dir() else run.name.split(".")[0]
@@ -178,7 +194,7 @@ def export(
     answer(as_json, {"files": list(map(str, outputs)), "stage": stage, "messages": lines}, *lines)
 
 
-def _export_capture(run: Path, folder: Path, as_json: bool) -> None:
+def _export_capture(run: Path, folder: Path, repeat: int, deblurred: bool, as_json: bool) -> None:
     """Write the frames of ``run`` for other trainers."""
     from cleargs.handover import SPLIT
     from cleargs.run_results import open_prepared, open_run
@@ -186,7 +202,16 @@ def _export_capture(run: Path, folder: Path, as_json: bool) -> None:
 
     found = open_run(run)
     weights = found["rva"].weights() if "rva" in found.stages else None
-    made = open_prepared(found["ingest"]).to_nerfstudio(folder, weights)
+    prepared = open_prepared(found["ingest"])
+    sharper = None
+    if deblurred:
+        from cleargs.formation.frames import view_of
+        from cleargs.rivr.distillation import TrainedScene
+
+        trained = TrainedScene(run / scene_stage(installed(), run, None))
+        views = {frame.frame_id: view_of(frame, prepared.folder, 1.0) for frame in prepared.frames}
+        sharper = lambda number: trained.deblur(views[number])  # noqa: E731
+    made = prepared.to_nerfstudio(folder, weights, repeat=repeat, sharper=sharper)
     split = read_json(made / SPLIT)
     lines = [f"written: {made} ({len(split['train'])} frames for training, {len(split['test'])} held out)"]
     lines.append(f"nerfstudio: ns-train splatfacto --data {quote(str(made))}")
