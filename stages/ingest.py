@@ -6,6 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,7 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
 def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, rotate and reduce them, find poses or use the given ones, undistort and publish."""
     from cleargs.capture.choice import held_out, holdout_hash, select_sharp_frames
+    from cleargs.capture.known_models import file_of
     from cleargs.capture.measuring import measure_motion, write_motion
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
@@ -162,7 +164,17 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     long_side = max(config.feature_size, config.max_size)
     capture = select_sharp_frames(capture, long_side, reporter, by_motion=config.fps is None)
     frames = prepare(capture, work, long_side, reporter)
-    scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
+    program = (VERSION, *map(metadata.version, LIBRARIES))
+    scene = reconstruct(
+        frames,
+        capture.model,
+        work,
+        config,
+        context.seed,
+        context.threads,
+        reporter,
+        known=lambda job: file_of(job, context.cache, program),
+    )
     scene = scene.turned_up(frames, reporter)
     scene, motion = measure_motion(capture, frames, scene, work, reporter)
     registered = {image.name for image in scene.model.images.values()}

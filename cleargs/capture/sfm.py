@@ -8,7 +8,7 @@ itself runs in `cleargs.capture.sfm_worker`, a child process.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -17,6 +17,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from cleargs.capture import known_models
 from cleargs.capture.adjustment import FIRST_LENS
 from cleargs.capture.cameras import (
     COLMAPS_GUESS,
@@ -136,8 +137,11 @@ def reconstruct(
     seed: int,
     threads: int,
     reporter: Reporter,
+    known: Callable[[Job], Path] | None = None,
 ) -> Reconstruction:
     """Return poses, cameras and points of the working images in ``folder``, in which COLMAP works too.
+
+    ``known`` returns the file that keeps the model of a job for later runs (`known_models.file_of`).
 
     Poses of the input are normalised in float64 before COLMAP uses them. The sparse model ``given`` with the
     input replaces the triangulation if its poses fit the images. StageError is raised if too few frames get
@@ -150,7 +154,7 @@ def reconstruct(
     if not posed:
         job = job_of(frames, None, folder, config, seed, threads)
         try:
-            model, outcome = _found(job, reporter)
+            model, outcome = _found(job, reporter, known)
         except StageError as error:
             if str(error) == NO_DEPTH or not any(map(stated_focal, filter(None, job.exif_images))):
                 raise
@@ -161,7 +165,7 @@ def reconstruct(
             alone = folder / "without-exif"
             alone.mkdir(exist_ok=True)
             job = job.model_copy(update={"folder": alone, "exif_images": [None] * len(job.exif_images)})
-            model, outcome = _found(job, reporter)
+            model, outcome = _found(job, reporter, known)
         _check_registered(len(model.images), len(frames), config, reporter)
         _report_lens(model, frames, config, reporter)
         if outcome.shifts_px:
@@ -192,7 +196,7 @@ def reconstruct(
         if 0 < missed <= config.refine_above and not stale:
             return Reconstruction(adopted, world, SfmOutcome(placed=_placed(frames, {}), missed_px=missed))
     readings = {name: [world.pose(pose) for pose in read] for name, (world, read) in worlds.items()}
-    model, outcome = _run(job_of(posed, readings, folder, config, seed, threads), reporter)
+    model, outcome = _run(job_of(posed, readings, folder, config, seed, threads), reporter, known)
     if not len(model.point_ids):
         raise StageError(
             "no point could be triangulated at the given poses",
@@ -321,9 +325,11 @@ def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, report
         )
 
 
-def _found(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
+def _found(
+    job: Job, reporter: Reporter, known: Callable[[Job], Path] | None
+) -> tuple[SparseModel, SfmOutcome]:
     """Return the model of `_run`. Raises StageError if it has too few frames."""
-    model, outcome = _run(job, reporter)
+    model, outcome = _run(job, reporter, known)
     _require_registered(len(model.images), len(job.names), job.config)
     return model, outcome
 
@@ -339,13 +345,20 @@ def _check_registered(registered: int, total: int, config: SfmConfig, reporter: 
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
 
 
-def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
-    """Run COLMAP in a child process, unless a killed run has already made the model."""
+def _run(job: Job, reporter: Reporter, known: Callable[[Job], Path] | None) -> tuple[SparseModel, SfmOutcome]:
+    """Run COLMAP in a child process, unless a killed or an earlier run has already made the model."""
     if (found := _resumed(job.folder, reporter)) is not None:
+        return found
+    kept = known(job) if known is not None else None
+    taken = kept is not None and known_models.take(kept, job.folder / "model")
+    if taken and (found := _resumed(job.folder, reporter)) is not None:
+        reporter.info("poses and points: those of an earlier run of the same pictures")
         return found
     file = job.folder / "job.json"
     write_json(file, job.model_dump(mode="json"))
     run_child("cleargs.capture.sfm_worker", file, job.folder / "colmap.log", reporter)
+    if kept is not None:
+        known_models.keep(job.folder / "model", kept)
     return _read(job.folder / "model")
 
 

@@ -88,6 +88,7 @@ def stage_at_work(run: Path, store: Path, *, stopped: bool = False) -> tuple[str
     kept = "no checkpoint yet"
     if nodes:
         step = _step_of(max(nodes, key=lambda node: node.stat().st_mtime_ns).path)
+        found = found.model_copy(update={"done": max(found.done, step or 0)})  # it shows every tenth step
         kept = "continues from its last checkpoint" if step is None else f"checkpoint at {step}"
     return found.stage, f"interrupted at {found.words}; {kept}"
 

@@ -66,7 +66,7 @@ def ingest(tmp_path: Path) -> Ingest:
             externals={},
             out=out,
             checkpoints=work,
-            cache=work / "kept",
+            cache=tmp_path / "kept",
             seed=0,
             device="cpu",
             threads=threads,

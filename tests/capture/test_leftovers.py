@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from cleargs.capture import sfm
 from cleargs.capture.sfm_job import OUTCOME
 from cleargs.digest import file_digest
 from cleargs.files import remove
@@ -69,6 +70,7 @@ def test_damaged_leftovers(
 ) -> None:
     first = ingest(posed, **settings)
     healthy = digests(first.out)
+    remove(tmp_path / "kept")
     DAMAGES[what](tmp_path / "out.work", tmp_path / "out")
     again = ingest(posed, **settings)
     assert digests(again.out) == healthy
@@ -84,6 +86,7 @@ def test_a_damaged_database_is_made_again(
     healthy = digests(ingest(posed, **settings).out)
     for damage in (empty, cut, garbage):
         remove(tmp_path / "out.work" / "model")
+        remove(tmp_path / "kept")
         damage(tmp_path / "out.work" / "database.db")
         assert digests(ingest(posed, **settings).out) == healthy
 
@@ -93,8 +96,29 @@ def test_a_model_that_does_not_say_how_frames_were_placed_is_made_again(
 ) -> None:
     healthy = digests(ingest(images, **settings).out)
     for damage in (empty, garbage, Path.unlink):
+        remove(tmp_path / "kept")
         damage(tmp_path / "out.work" / "model" / OUTCOME)
         assert digests(ingest(images, **settings).out) == healthy
+
+
+@pytest.mark.slow  # about 5 s of one core: COLMAP runs four times
+def test_other_held_out_frames_need_no_new_poses(
+    posed: Path, ingest: Ingest, tmp_path: Path, settings: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search took minutes, for poses that do not depend on the frames that are held out."""
+    fresh = digests(ingest(posed, "fresh", **settings, holdout="every:4").out)
+    remove(tmp_path / "kept")
+    ingest(posed, "first", **settings)
+    searches: list[str] = []
+    searched = sfm.run_child
+    monkeypatch.setattr(sfm, "run_child", lambda *given: (searches.append(given[0]), searched(*given)))
+    again = ingest(posed, "again", **settings, holdout="every:4")
+    assert searches == [] and any("earlier run" in line for line in again.infos)
+    assert digests(again.out) == fresh and digests(again.out) != digests(tmp_path / "first")
+    (kept,) = (tmp_path / "kept").iterdir()
+    cut(kept)
+    assert digests(ingest(posed, "damaged", **settings, holdout="every:4").out) == fresh
+    assert len(searches) == 1
 
 
 def test_foreign_images_and_masks_are_not_published(

@@ -167,6 +167,7 @@ def test_an_interrupted_task_stays_visible(tmp_path: Path) -> None:
     assert stage_at_work(tmp_path, tmp_path / "store") == tuple(lines[0].split(": ", 1))
     for write, said in (
         (lambda: save_state(checkpoint, {"step": torch.tensor(100)}), "checkpoint at 100"),
+        (lambda: save_state(checkpoint, {"step": torch.tensor(130)}), "checkpoint at 130"),
         (checkpoint.unlink, "no checkpoint yet"),
     ):
         write()
