@@ -125,7 +125,7 @@ def test_the_same_command_again_does_nothing(capture: Path, finished: Path) -> N
 def test_a_setting_redoes_only_what_reads_it(capture: Path, finished: Path) -> None:
     done = finish(capture, finished, "--set", "consolidate.distil.steps=10", "--dry-run", "--json")
     states = {row["stage"]: row["state"] for row in json.loads(done.stdout)}
-    assert states == {**dict.fromkeys(STAGES, "done"), "consolidate": "missing"}
+    assert states == {**dict.fromkeys(STAGES, "done"), "consolidate": "outdated"}
 
 
 @pytest.mark.slow

@@ -187,7 +187,7 @@ def run(
             runner = Runner(dag, settings, opened, threads, reporter)
             if dry_run:
                 plans = runner.plan(until, tuple(dag.check(name) for name in force))
-                print_plans(plans, as_json, settings.stages(dag))
+                print_plans(_with_outdated(plans, settings.folder, dag), as_json, settings.stages(dag))
                 return 0
             log(
                 f"cleargs {cleargs.__version__}, {settings.device}, {threads} threads, store {settings.store}"
@@ -300,15 +300,20 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
         return
     with opened_store(settings.store) as opened:
         plans = Planner(dag, settings, opened, usable_cores(), make_reporter()).plan()
-    shown = linked_manifests(settings.folder, dag.names)
-    plans = [
-        replace(plan, state="outdated") if plan.state == "missing" and plan.stage in shown else plan
-        for plan in plans
-    ]
+    plans = _with_outdated(plans, settings.folder, dag)
     if at_work := stage_at_work(settings.folder, settings.store):
         name, text = at_work
         plans = [replace(plan, reasons=(text,)) if plan.stage == name else plan for plan in plans]
     print_plans(plans, as_json, settings.stages(dag))
+
+
+def _with_outdated(plans: list[StagePlan], run: Path, dag: Dag) -> list[StagePlan]:
+    """Return the plans; stages that have results of other settings or inputs are outdated, not missing."""
+    shown = linked_manifests(run, dag.names)
+    return [
+        replace(plan, state="outdated") if plan.state == "missing" and plan.stage in shown else plan
+        for plan in plans
+    ]
 
 
 def print_lines(outcomes: Sequence[StageOutcome], lines: Sequence[str]) -> None:

@@ -108,6 +108,8 @@ def export_scene(
         write_json(file, views_json(views, next(iter(cameras.values()))[1], **similarity))
         messages.append(f"{file}: {len(views)} views")
     axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
+    if options.metres is not None:
+        axes += f", in metres (a unit of the run is {similarity['scale']:.4g} m)"
     eyes = np.stack([camera.centre for _, camera in cameras.values()])
     if similarity:
         eyes = similarity["scale"] * eyes @ similarity["rotation"].T + similarity["translation"]
@@ -201,7 +203,7 @@ def _write(
     messages = []
     if "ply" in outputs.values() and 0 < (degree := scene.gaussians.sh_degree) < 3:
         messages.append(
-            f"spherical harmonics of degree {degree}: for viewers of degree 3 only, --sh-degree 3"
+            f"spherical harmonics of degree {degree}; for a viewer that reads only degree 3: --sh-degree 3"
         )
     for output, kind in outputs.items():
         with disk_errors(output):

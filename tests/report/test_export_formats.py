@@ -137,6 +137,7 @@ def test_metres(run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[
     for more in ([], ["--world", "input"], ["--up", "z"]):
         scaled = positions("--metres", f"{numbers[0] - 1}-{numbers[2] - 1}=3.5", *more)
         assert np.linalg.norm(scaled[0] - scaled[2]) == pytest.approx(3.5)
+    assert "in metres (a unit of the run is" in capsys.readouterr().out
     shape = np.linalg.norm(plain - plain[0], axis=1) / np.linalg.norm(plain[2] - plain[0])
     assert np.allclose(np.linalg.norm(scaled - scaled[0], axis=1) / 3.5, shape)
     for wrong in ("0-999=2", "0=2", "0-1=0"):
