@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from cleargs.base_model import FrozenModel
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.rivr.gates import GateConfig
+from cleargs.rivr.config import RepairConfig
 from cleargs.rivr.harm import HarmConfig
 from cleargs.splat.config import TrainConfig
 
@@ -21,7 +20,7 @@ from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
     from cleargs.rivr.distillation import TrainedScene
-    from cleargs.rivr.rounds import Rules
+    from cleargs.rivr.rounds import RepairContext
     from cleargs.rivr.tables import Selection
     from cleargs.rivr.targets import Supervision
     from cleargs.splat.views import TrainingView
@@ -38,7 +37,7 @@ class RoundsConfig(DistilConfig):
     )
 
 
-class RivrConfig(FrozenModel):
+class RivrConfig(RepairConfig):
     """Render-Guided In-Video Restoration."""
 
     rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="rounds in which every target frame is repaired")
@@ -70,31 +69,6 @@ class RivrConfig(FrozenModel):
         "along the trajectory, and the repairs of a group are distilled before the next one is rendered, as "
         "in the paper; unset = one group. The groups share distil.steps of the round",
     )
-    margin: float = Field(
-        1.0, ge=0.0, le=100.0, description="primary scores this close to the best go to the tie-break scorer"
-    )
-    keep_raw: bool = Field(
-        True,
-        description="a raw frame that needs no repair is trained on as filmed; false: every target frame "
-        "gets a pseudo observation, as in the paper",
-    )
-    fuse_sigma: float = Field(
-        2.0, gt=0.0, le=100.0, description="Gaussian that splits detail from base in the fusion, px"
-    )
-    use_observation: bool = Field(
-        True, description="false: the ablation whose expert restores the render instead of the raw frame"
-    )
-    undo_motion: bool = Field(
-        True,
-        description="with use_observation: undo the blur and the skew of the camera's motion in the raw "
-        "frame before the expert restores it; false: the expert restores the raw frame, as in the paper",
-    )
-    use_fused: bool = Field(
-        False,
-        description="a third candidate, as in the paper: the render with the detail of the restored frame. "
-        "With undo_motion the restored frame already has the render's detail; the fusion has it twice",
-    )
-    gate: GateConfig = Field(GateConfig(), description="limits beyond which a repair is refused")
     distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")
     harm: HarmConfig = Field(
         HarmConfig(), description="limits beyond which the distilled scene is rejected for G0"
@@ -115,7 +89,7 @@ class RivrConfig(FrozenModel):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 53
+VERSION = 54
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -141,10 +115,13 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: RivrConfig) -> None:
-    """Load expert and scorers. Raises InputError if one is not installed, is damaged, or cannot be used."""
+    """Load candidates and models. Raises InputError if one is not installed, is damaged, or unusable."""
     from cleargs.models.expert import load_expert
     from cleargs.models.scorer import load_scorer
+    from cleargs.rivr.candidates import candidate
 
+    for name in config.candidates:
+        candidate(name)
     load_expert(config.expert)
     for name in (config.primary_scorer, config.tiebreak_scorer):
         load_scorer(name)
@@ -188,7 +165,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import TrainedScene, check_harm, publish
     from cleargs.rivr.need import frames_to_repair, rows_of_others
-    from cleargs.rivr.rounds import Rules, forget_others
+    from cleargs.rivr.rounds import RepairContext, forget_others
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
     from cleargs.splat.backend import set_threads
@@ -205,23 +182,17 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     forget_others(context.out, config.rounds, targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
-    rules = Rules(
-        expert=expert,
+    repairing = RepairContext(
+        config,
+        expert,
         primary=load_scorer(config.primary_scorer, networks_on),
         tiebreak=load_scorer(config.tiebreak_scorer, networks_on),
         cache=context.checkpoints / "restored",
         threads=threads,
-        use_observation=config.use_observation,
-        undo_motion=config.undo_motion,
-        use_fused=config.use_fused,
-        keep_raw=config.keep_raw,
-        fuse_sigma=config.fuse_sigma,
-        margin=config.margin,
-        gate=config.gate,
     )
     reporter.info(f"RIVR: {len(targets)} of {len(supervision.views)} frames are tried")
     others = rows_of_others(chosen, supervision, g0.formations)
-    rows, trainings, current = _repair_and_distil(context, supervision, targets, others, rules, g0)
+    rows, trainings, current = _repair_and_distil(context, supervision, targets, others, repairing, g0)
     write_selection(context.out / "selection.parquet", rows)
     made = len(rows) - len(others)
     if 2 * (refused := refused_repairs(rows)) > made:
@@ -231,7 +202,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         )
 
     repaired = any(row.accepted for row in rows)
-    checked = check_harm(g0, current, supervision, rules.primary, config.harm, threads, repaired=repaired)
+    checked = check_harm(g0, current, supervision, repairing.primary, config.harm, threads, repaired=repaired)
     if checked.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {checked.harm} on the control frames")
     final, rejected = (current, None) if checked.harm is None else (g0, current)
@@ -252,7 +223,7 @@ def _repair_and_distil(
     supervision: Supervision,
     targets: Sequence[TrainingView],
     others: Sequence[Selection],
-    rules: Rules,
+    repairing: RepairContext,
     g0: TrainedScene,
 ) -> tuple[list[Selection], list[Path], TrainedScene]:
     """Run every round along the trajectory, group by group.
@@ -279,7 +250,7 @@ def _repair_and_distil(
         for place, group in enumerate(groups):
             label = f"round {number}" + (f", group {place + 1} of {len(groups)}" if len(groups) > 1 else "")
             found = run_round(
-                number, group.targets, current, rules, context.out, reporter, label=f"{label}: candidates"
+                number, group.targets, current, repairing, context.out, reporter, label=f"{label}: candidates"
             )
             rows += found
             kept = kept_raw(rows)

@@ -34,7 +34,7 @@ METHOD: dict[str, Any] = {
     "rivr.undo_motion": False,
     "g0.formation.enabled": False,
     "rivr.keep_raw": False,
-    "rivr.use_fused": True,
+    "rivr.candidates": ("fused",),
     "rivr.gate.max_share": 1.0,  # no gate
     "rivr.distil.pseudo_share": "even",
     "rivr.distil.pseudo_weight": 1.0,

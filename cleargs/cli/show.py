@@ -307,8 +307,8 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     images |= formed_layers(row, run, scene_with_models([row], run, stages))
     if scene is not None and row.frame.registered:
         images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), row.affine)
-    shown = [name for name in LAYERS if name in images]
-    labels = {name: LAYERS[name] + (" (chosen)" if name == row.chosen else "") for name in shown}
+    shown = [name for name in dict.fromkeys((*LAYERS, *images)) if name in images]
+    labels = {name: LAYERS.get(name, name) + (" (chosen)" if name == row.chosen else "") for name in shown}
     tiles = [Tile(images[name], labels[name], marked=name == row.chosen) for name in shown]
     lines = [tiles[start : start + LAYERS_ACROSS] for start in range(0, len(tiles), LAYERS_ACROSS)]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -318,7 +318,8 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
 def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield label and text of each line about a frame; ``settings`` of RVA. ``--json`` prints more facts."""
-    from cleargs.report.frames import CHOICES, EFFECTS, scores_of
+    from cleargs.report.frames import EFFECTS, scores_of
+    from cleargs.rivr.candidates import phrase_of
 
     frame, rated = row.frame, facts["rva"]
     if row.weight_text:
@@ -353,11 +354,11 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any])
         yield "weight", f"{before:.2f} before image formation, {after:.2f} after it"
     for choice in row.rounds:
         refused = ", refused" if not choice.accepted and choice.chosen != "observed" else ""
-        yield f"round {choice.round}", f"{CHOICES[choice.chosen]}{refused} ({choice.reason})"
+        yield f"round {choice.round}", f"{phrase_of(choice.chosen)}{refused} ({choice.reason})"
         for metric, scores in scores_of(choice):
             yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
     if repair := facts["distilled"]:
-        yield "final scene", f"trained on {CHOICES[repair['chosen']]} of round {repair['round']}"
+        yield "final scene", f"trained on {phrase_of(repair['chosen'])} of round {repair['round']}"
 
 
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:

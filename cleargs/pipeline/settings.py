@@ -84,7 +84,8 @@ def allowed(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     if origin is Literal:
         words = " or ".join(map(str, parts))
     elif origin is tuple:
-        words = f"{len(parts)} values, each {allowed(parts[0])}"
+        count = "any number of" if parts[-1] is Ellipsis else len(parts)
+        words = f"{count} values, each {allowed(parts[0])}"
     elif origin in (Union, UnionType):
         words = " or ".join(allowed(kind) for kind in parts if kind is not NoneType)
     else:

@@ -25,14 +25,6 @@ from cleargs.types import ArrayF64, MaskBool
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles, on the page, of frames that RVA does not rate."""
 
-CHOICES = {
-    "render": "the render",
-    "restored": "the restored frame",
-    "fused": "the fusion of render and restored frame",
-    "observed": "kept as filmed",
-}
-"""Candidate -> its description in the report."""
-
 EFFECTS = {
     "blur": ("motion blur", "blur_px"),
     "skew": ("rolling shutter", "skew_px"),
@@ -159,12 +151,8 @@ def scene_with_models(rows: Sequence[FrameRow], run: Path, stages: Collection[st
 
 def scores_of(selection: Selection) -> list[tuple[str, dict[str, float]]]:
     """Return the deciding scorer, then the scorer for ties, each as (name, candidate -> score)."""
-    found = []
-    for use in ("primary", "tiebreak") if selection.exr is not None else ():
-        scores = {name: getattr(selection, f"{use}_{name}") for name in CHOICES}
-        known = {name: score for name, score in scores.items() if score is not None}
-        found.append((getattr(selection, f"{use}_metric"), known))
-    return found
+    uses = ((selection.primary_metric, selection.primary), (selection.tiebreak_metric, selection.tiebreak))
+    return [(metric, dict(scores)) for metric, scores in uses if metric is not None]
 
 
 SCENES = ("g0", "rivr", "consolidate")

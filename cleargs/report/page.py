@@ -28,7 +28,6 @@ from cleargs.program import program
 from cleargs.report.advice import command, shown_advice, toml_text
 from cleargs.report.formatting import duration
 from cleargs.report.frames import (
-    CHOICES,
     MEANINGS,
     SCENES,
     FrameRow,
@@ -51,6 +50,7 @@ from cleargs.report.report_json import (
 )
 from cleargs.report.single_file import single_file_size
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
+from cleargs.rivr.candidates import phrase_of
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.render import Viewer
@@ -146,7 +146,7 @@ def write_report(planner: Planner) -> Path:
             program=program(run.parent),
             aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
             data={
-                "layers": LAYERS,
+                "layers": {name: name for found in pictures.values() for name in found.layers} | LAYERS,
                 "meanings": MEANINGS,
                 "opening": {"left": "observed", "right": "final"},
                 "poor": LOOSE_DB,
@@ -198,7 +198,7 @@ def frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> di
     """Return the data of a frame for the page; ``time`` is its time in the viewer's animation, in seconds."""
     repair, why, scores = "none tried", "", {}
     if row.selection:
-        choice = CHOICES[row.selection.chosen]
+        choice = phrase_of(row.selection.chosen)
         refused = row.selection.chosen != "observed" and not row.chosen
         repair = f"kept as filmed, since {choice} was refused" if refused else choice
         scores = dict(scores_of(row.selection))

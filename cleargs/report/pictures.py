@@ -20,6 +20,7 @@ from cleargs.formation.movement import still_pixels
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_mask, read_rgb, reduced, to_uint8
 from cleargs.report.frames import HELD_OUT, FrameRow
+from cleargs.rivr.candidates import CANDIDATES
 from cleargs.rivr.distillation import TrainedScene
 from cleargs.splat.render import Viewer
 from cleargs.types import ImageU8, MaskBool
@@ -29,9 +30,7 @@ LAYERS = {
     "paths": "Paths during the exposure",
     "explained": "Render with camera effects",
     "deblurred": "Deblurred",
-    "restored": "Restored",
-    "fused": "Fused",
-    "render": "Scene before repair",
+    **{name: CANDIDATES[name].label for name in reversed([*CANDIDATES])},
     "masked": "Not used: masked",
     "moving": "Not used: moves",
     "final": "Final scene",
@@ -167,7 +166,7 @@ def _write_frame(
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
-    names = [layer for layer in LAYERS if layer in images]
+    names = [layer for layer in dict.fromkeys((*LAYERS, *images)) if layer in images]
     layers = {layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side) for layer in names}
     unseen = _aligned_psnr(final, images["observed"]) if final is not None and row.role == HELD_OUT else None
     return FramePictures(write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers, unseen)
