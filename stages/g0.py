@@ -48,7 +48,10 @@ def externals(config: G0Config, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: G0Config) -> None:
-    """Check nothing: no model is needed."""
+    """Load the strategy of densification. Raises InputError if another package lacks it."""
+    from cleargs.splat.budget import training_cost
+
+    training_cost(config, frames=1, megapixels=0.1, start=1)
 
 
 def estimate(context: StageContext[G0Config]) -> Estimate:

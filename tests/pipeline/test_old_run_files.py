@@ -58,7 +58,7 @@ def test_later_trainings_follow_the_first() -> None:
     sections: Any = load_config(installed(), "default", ["g0.lr_sh=0.5", "g0.quality=draft"]).sections
     for stage in ("rivr", "consolidate"):
         training = sections[stage].distil.applied_to(sections["g0"], 100)
-        assert (training.lr_sh, training.quality, training.densify) == (0.5, "draft", False)
+        assert (training.lr_sh, training.quality, training.densify) == (0.5, "draft", "off")
 
 
 def test_settings_are_few() -> None:

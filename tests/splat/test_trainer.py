@@ -131,7 +131,7 @@ def test_saturated_pixels_do_not_darken_the_scene(pictures: list[np.ndarray], tm
     )
     still = CONFIG.model_copy(
         update={
-            "densify": False,
+            "densify": "off",
             "noise": 0.0,
             "opacity_reg": 0.0,
             "scale_reg": 0.0,
@@ -494,7 +494,7 @@ def test_pseudo_views_get_their_share_and_weight(pictures: list[np.ndarray], tmp
 
 
 def test_without_densification_the_number_stays(pictures: list[np.ndarray], tmp_path: Path) -> None:
-    trained = run(pictures, tmp_path, CONFIG.model_copy(update={"densify": False}))
+    trained = run(pictures, tmp_path, CONFIG.model_copy(update={"densify": "off"}))
     assert trained.scene.gaussians.num == 60
 
 
@@ -626,7 +626,7 @@ def test_a_scene_that_is_not_finite_is_refused(pictures: list[np.ndarray], tmp_p
 def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: Path) -> None:
     darker = [*pictures[:3], *((picture * 0.8).astype(np.uint8) for picture in pictures[3:])]
     weights = [1.0, 0.9, 0.8, 0.9, 0.5, 0.12]
-    config = CONFIG.model_copy(update={"steps": 300, "densify": False, "lr_sh": 1e-3})
+    config = CONFIG.model_copy(update={"steps": 300, "densify": "off", "lr_sh": 1e-3})
     formation = affines(weights, rate=3e-3)
     trained = run(
         views(darker, weights=weights), tmp_path, config, scene=Scene(gaussians()), formation=formation
