@@ -56,7 +56,7 @@ def initialise(
         scene = cg.initialise(capture, config=cg.G0Config(sh_degree=1))
     """
     from cleargs import G0Config
-    from cleargs.formation.frames import seen_points
+    from cleargs.scene.views import seen_points
     from cleargs.splat.initialise import starting_gaussians
     from cleargs.splat.scene import BLACK, Scene
 

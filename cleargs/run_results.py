@@ -228,7 +228,7 @@ class Prepared:
         Returns:
             Views that read their images when these are needed.
         """
-        from cleargs.formation.frames import real_views
+        from cleargs.scene.views import real_views
 
         require_images(self.folder.parent, "training")
         given = {frame.frame_id: 1.0 for frame in self.frames} if weights is None else weights
@@ -236,7 +236,7 @@ class Prepared:
 
     def cameras(self) -> dict[int, Camera]:
         """Return frame_id -> camera for all frames with a pose, including held-out frames."""
-        from cleargs.formation.frames import camera_of
+        from cleargs.scene.views import camera_of
 
         posed = (frame for frame in self.frames if frame.registered)
         return {frame.frame_id: camera_of(frame) for frame in posed}

@@ -18,9 +18,6 @@ G0_END, ROUNDS_END = 16 / 19, 18 / 19
 MAX_ROUNDS = 16
 """Maximum number of RIVR's rounds."""
 
-TRAINED = ("scene.ply", "exposure.parquet", "formation.parquet", "movement.parquet", "state.safetensors")
-"""Outputs of a training from which the next training continues."""
-
 REPAIR_LIBRARIES = (
     "torch",
     "numba",

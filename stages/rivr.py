@@ -13,16 +13,17 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import RepairConfig
 from cleargs.rivr.harm import HarmConfig
+from cleargs.scene.folder import LOG, TRAINED, SceneFolder
 from cleargs.splat.config import TrainConfig
 
-from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
+from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, DistilConfig
 from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
-    from cleargs.rivr.distillation import TrainedScene
     from cleargs.rivr.rounds import RepairContext
     from cleargs.rivr.tables import Selection
     from cleargs.rivr.targets import Supervision
+    from cleargs.scene.viewer import SceneViewer
     from cleargs.splat.views import TrainingView
 
 
@@ -97,7 +98,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "rva": ("frames.parquet",),
     "g0": TRAINED,
 }
-OUTPUTS = (*TRAINED, "train.parquet", "selection.parquet")
+OUTPUTS = (*TRAINED, LOG, "selection.parquet")
 LEFTOVERS = ("round_*/*.exr",)
 LIBRARIES = REPAIR_LIBRARIES
 
@@ -163,18 +164,19 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.distillation import TrainedScene, check_harm, publish
+    from cleargs.rivr.distillation import check_harm
     from cleargs.rivr.need import frames_to_repair, rows_of_others
     from cleargs.rivr.rounds import RepairContext, forget_others
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
+    from cleargs.scene.viewer import SceneViewer
     from cleargs.splat.backend import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
     measured = load_paths(context.inputs["ingest"])
-    g0 = TrainedScene(context.inputs["g0"], context.device, measured)
+    g0 = SceneViewer(context.inputs["g0"], context.device, measured)
     if context.settings["g0"].quality == "draft":
         return _unchanged(context, supervision, g0)
     chosen = frames_to_repair(config.targets, supervision, g0.formations)
@@ -205,8 +207,8 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     checked = check_harm(g0, current, supervision, repairing.primary, config.harm, threads, repaired=repaired)
     if checked.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {checked.harm} on the control frames")
-    final, rejected = (current, None) if checked.harm is None else (g0, current)
-    publish(final, trainings, context.out, rejected)
+    final, rejected = (current, None) if checked.harm is None else (g0, current.files)
+    final.files.publish(trainings, context.out, rejected)
     return StageResult(
         summary={
             "expert": expert.name,
@@ -224,15 +226,15 @@ def _repair_and_distil(
     targets: Sequence[TrainingView],
     others: Sequence[Selection],
     repairing: RepairContext,
-    g0: TrainedScene,
-) -> tuple[list[Selection], list[Path], TrainedScene]:
+    g0: SceneViewer,
+) -> tuple[list[Selection], list[SceneFolder], SceneViewer]:
     """Run every round along the trajectory, group by group.
 
     A round that accepts no candidate is the last one. Its training also gets the steps of the remaining
     rounds. Returns the rows of all frames (first ``others``, the rows of frames that no round repairs), the
     folders of the trainings, and the last scene.
     """
-    from cleargs.rivr.distillation import drop_state
+    from cleargs.rivr.distillation import distil
     from cleargs.rivr.rounds import pseudo_view, run_round
     from cleargs.rivr.tables import kept_raw, repaired_share
     from cleargs.rivr.targets import trajectory_groups
@@ -242,7 +244,7 @@ def _repair_and_distil(
     length = config.distil.applied_to(g0_config, frames).length
     groups = trajectory_groups(targets, config.group, length)
     rows = list(others)
-    trainings: list[Path] = []
+    trainings: list[SceneFolder] = []
     current = g0
     for number in range(1, config.rounds + 1):
         steps = done = 0
@@ -270,7 +272,8 @@ def _repair_and_distil(
             # Nothing is trained without repairs and kept frames: the next group gets the steps.
             if not (repairs or kept) or not steps:
                 continue
-            current = current.trained(
+            current = distil(
+                current,
                 [*supervision.real, *repairs],
                 config.distillation(g0_config, number, done, steps, frames),
                 context.checkpoints / f"round_{number:02d}" / f"group_{place + 1:03d}",
@@ -284,20 +287,19 @@ def _repair_and_distil(
             )
             done, steps = done + steps, 0
             if trainings:
-                drop_state(trainings[-1])
-            trainings.append(current.folder)
+                trainings[-1].drop_state()
+            trainings.append(current.files)
         if not taken:
             break
     return rows, trainings, current
 
 
-def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: TrainedScene) -> StageResult:
+def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: SceneViewer) -> StageResult:
     """Publish G0's scene unchanged: a draft makes no repairs."""
-    from cleargs.rivr.distillation import publish
     from cleargs.rivr.tables import Selection, write_selection
 
     context.reporter.info("RIVR: no repairs in a draft: the scene of G0 stays as it is")
     rows = [Selection.not_tried(frame_id, "not tried: a draft") for frame_id in supervision.views]
     write_selection(context.out / "selection.parquet", rows)
-    publish(g0, [], context.out, None)
+    g0.files.publish([], context.out, None)
     return StageResult(summary={"rounds": [], "published": "G0", "draft": True})

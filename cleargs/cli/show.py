@@ -257,9 +257,9 @@ def _show_frame(
 
     Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
-    from cleargs.formation.frames import camera_of
     from cleargs.report.frames import MEANINGS, load_rows, worst_cue
     from cleargs.rivr.tables import REPAIRS
+    from cleargs.scene.views import camera_of
 
     if "ingest" not in done:
         raise InputError(f"{run} has no frames yet", hint=f"see cleargs status {run}")
@@ -295,18 +295,18 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
     They are the raw frame, the layers of its latest round or image formation, and the last scene at its pose.
     """
-    from cleargs.formation.frames import camera_of
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
     from cleargs.report.frames import last_scene, scene_with_models
     from cleargs.report.pictures import LAYERS, formed_layers, layers_of
-    from cleargs.splat.ply import read_ply
+    from cleargs.scene.folder import SceneFolder
+    from cleargs.scene.views import camera_of
     from cleargs.splat.render import Viewer
 
     images, scene = layers_of(row, run), last_scene(stages)
     images |= formed_layers(row, run, scene_with_models([row], run, stages))
     if scene is not None and row.frame.registered:
-        images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), row.affine)
+        images["final"] = Viewer(SceneFolder(run / scene).scene()).view(camera_of(row.frame), row.affine)
     shown = [name for name in dict.fromkeys((*LAYERS, *images)) if name in images]
     labels = {name: LAYERS.get(name, name) + (" (chosen)" if name == row.chosen else "") for name in shown}
     tiles = [Tile(images[name], labels[name], marked=name == row.chosen) for name in shown]

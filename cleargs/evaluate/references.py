@@ -25,8 +25,6 @@ from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.refinement import rotation_between
-from cleargs.formation.exposure import read_exposure
-from cleargs.formation.frames import has_alpha, view_of
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
@@ -34,6 +32,8 @@ from cleargs.media.image import read_transparency
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.packed import require_images
 from cleargs.progress import Reporter
+from cleargs.scene.folder import SceneFolder
+from cleargs.scene.views import has_alpha, view_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64, ImageU8, MaskBool
@@ -322,7 +322,7 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
     if made.parts.inputs.get("ingest", {}).get("images") != tree_digest(ingest.under("images")):
         return None
     try:
-        trained = {int(number) for number in read_exposure(run / stage / "exposure.parquet").frame_ids}
+        trained = {int(number) for number in SceneFolder(run / stage).exposure().frame_ids}
     except StoreError:
         return None
     own = {stem_of(frame.name): frame for frame in load_frames(run / "ingest") if frame.frame_id in trained}

@@ -19,7 +19,6 @@ from cleargs.capture.tables import load_frames, load_points
 from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_bytes, write_json
-from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
 from cleargs.named_views import NamedView, read_views
 from cleargs.pipeline.dag import installed
@@ -27,6 +26,7 @@ from cleargs.pipeline.outputs import check_outputs
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.run_results import scene_path
+from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
 from cleargs.splat.ply import read_ply

@@ -13,7 +13,6 @@ import numpy as np
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
-from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
@@ -25,6 +24,7 @@ from cleargs.render.output import Kind, Shot, kind_of, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.run_results import scene_path
 from cleargs.safe_io import FAULTS, cause, read_json
+from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.formats import read_scene
 

@@ -18,10 +18,8 @@ from rich.filesize import decimal
 import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder, write_bytes
-from cleargs.formation.frames import camera_of
 from cleargs.manifest import plain_json
 from cleargs.named_views import read_views
-from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.program import program
@@ -51,8 +49,9 @@ from cleargs.report.report_json import (
 from cleargs.report.single_file import single_file_size
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
 from cleargs.rivr.candidates import phrase_of
+from cleargs.scene.folder import SCENE, SceneFolder
+from cleargs.scene.views import camera_of
 from cleargs.splat.backend import set_threads
-from cleargs.splat.ply import read_ply
 from cleargs.splat.render import Viewer
 from cleargs.splat.tables import TRAIN
 
@@ -170,7 +169,7 @@ def _write_scene(
     """Write the last scene, with a still. Return its data for the template, and its renderer."""
     camera = camera_of(opening_frame(placed).frame)
     still = camera.scaled(_STILL / max(camera.width, camera.height))
-    scene = read_ply(run / stage / "scene.ply")
+    scene = SceneFolder(run / stage).scene()
     renderer = Viewer(scene)
     data = {
         "gaussians": scene.gaussians.num,
@@ -179,8 +178,8 @@ def _write_scene(
         "shown_degree": write_scene(folder / "scene.js", "scene", scene),
         "antialias": scene.antialias,
         "background": scene.background,
-        "file": f"../{stage}/scene.ply",
-        "bytes": (run / stage / "scene.ply").stat().st_size,
+        "file": f"../{stage}/{SCENE}",
+        "bytes": (run / stage / SCENE).stat().st_size,
     }
     return data, renderer
 
@@ -240,8 +239,8 @@ def training_curves(run: Path, stages: Sequence[str]) -> dict[str, Any] | None:
     Loss and PSNR are those of steps on raw frames. They are medians over equal intervals: each step shows one
     view, and views differ more than steps. Raises StoreError if a table cannot be read.
     """
-    paths = [(stage, run / stage / "train.parquet") for stage in stages]
-    tables = {stage: read_table(path, TRAIN) for stage, path in paths if path.is_file()}
+    logs = {stage: SceneFolder(run / stage).log() for stage in stages}
+    tables = {stage: log for stage, log in logs.items() if log is not None}
     steps = pa.concat_tables([TRAIN.empty_table(), *tables.values()])
     real = np.array(steps["kind"].to_pylist()) == "real"
     if not real.any():

@@ -34,9 +34,9 @@ class RepairConfig(FrozenModel):
     )
     candidates: tuple[str, ...] = Field(
         (),
-        description="candidates in addition to the render and the restored frame: fused (the render with the detail "
-        "of the restored frame, as in the paper), or one of another package. With undo_motion the restored "
-        "frame already has the render's detail; the fusion has it twice",
+        description="candidates in addition to the render and the restored frame: fused (the render with the "
+        "detail of the restored frame, as in the paper), or one of another package. With undo_motion the "
+        "restored frame already has the render's detail; the fusion has it twice",
         json_schema_extra={"plugin": "candidates"},
     )
     gate: GateConfig = Field(GateConfig(), description="limits beyond which a repair is refused")

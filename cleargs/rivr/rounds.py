@@ -31,9 +31,9 @@ from cleargs.rivr.candidates import (
     is_negligible_change,
 )
 from cleargs.rivr.config import RepairConfig
-from cleargs.rivr.distillation import Deblurred, TrainedScene, observation
 from cleargs.rivr.gates import rejection_reason
 from cleargs.rivr.tables import Selection, chosen_counts
+from cleargs.scene.viewer import Deblurred, SceneViewer, observation
 from cleargs.splat.views import TrainingView
 from cleargs.types import ImageF32, MaskBool
 
@@ -57,7 +57,7 @@ class RepairContext:
     threads: int
 
     def restored(
-        self, view: TrainingView, render: ImageF32, scene: TrainedScene
+        self, view: TrainingView, render: ImageF32, scene: SceneViewer
     ) -> tuple[ImageF32, Source, Deblurred | None]:
         """Restore a frame, after undoing the motion that ``scene`` has found in it. ``render`` is its R_t.
 
@@ -89,7 +89,7 @@ class RepairContext:
 def run_round(
     number: int,
     targets: Sequence[TrainingView],
-    scene: TrainedScene,
+    scene: SceneViewer,
     context: RepairContext,
     out: Path,
     reporter: Reporter,
@@ -119,7 +119,7 @@ def run_round(
 
 
 def repair(
-    number: int, view: TrainingView, exr: str, scene: TrainedScene, context: RepairContext
+    number: int, view: TrainingView, exr: str, scene: SceneViewer, context: RepairContext
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 

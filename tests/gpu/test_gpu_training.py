@@ -14,8 +14,8 @@ from helpers import splat_toy
 from cleargs.errors import StageError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure
-from cleargs.formation.observed import evaluate_views
 from cleargs.progress import SilentReporter
+from cleargs.scene.measure import evaluate_views
 from cleargs.splat import densification
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians

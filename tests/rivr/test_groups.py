@@ -151,9 +151,9 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
         ("cleargs.rivr.rounds.write_exr", 4),  # at the start of the third
         ("cleargs.splat.trainer.Trainer.step", 4),  # inside the second group's distillation
         ("cleargs.splat.trainer.Trainer.step", 11),  # inside the third's, after its checkpoint
-        ("cleargs.rivr.distillation.write_ply", 1),  # at the end of the second's, before its last file
-        ("cleargs.rivr.distillation.drop_state", 3),  # between two groups of round 2
-        ("cleargs.rivr.distillation._copy", 1),  # while publishing
+        ("cleargs.splat.ply.write_ply", 1),  # at the end of the second's, before its last file
+        ("cleargs.scene.folder.SceneFolder.drop_state", 3),  # between two groups of round 2
+        ("cleargs.scene.folder._copy", 1),  # while publishing
     ],
 )
 def test_a_run_killed_among_its_groups_goes_on_to_the_same_files(

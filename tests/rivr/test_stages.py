@@ -35,13 +35,11 @@ from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.movement import write_movement
-from cleargs.formation.observed import Fit, evaluate_views
 from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.progress import SilentReporter
 from cleargs.rivr import rounds
 from cleargs.rivr.candidates import decide, fuse
-from cleargs.rivr.distillation import TrainedScene
 from cleargs.rivr.tables import (
     REPAIRS,
     SELECTION,
@@ -53,6 +51,8 @@ from cleargs.rivr.tables import (
     write_selection,
 )
 from cleargs.rivr.targets import load_supervision
+from cleargs.scene.measure import ViewPsnr, evaluate_views
+from cleargs.scene.viewer import SceneViewer
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import TrainingView
@@ -258,8 +258,8 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
     view = supervision.views[2]
     formation = CaptureFormation([view], FormationConfig(), known={2: found})
     write_formation(capture.root / "g0" / "formation.parquet", formation, {2: view.weight})
-    scene = TrainedScene(capture.root / "g0")
-    monkeypatch.setattr("cleargs.rivr.distillation.fit_motion", None)
+    scene = SceneViewer(capture.root / "g0")
+    monkeypatch.setattr("cleargs.scene.viewer.fit_motion", None)
     undone = scene.deblur(view)
     assert undone is not None and undone.formation.blur_px == 6.0
     whole, half = scene.formed_layers(view), scene.formed_layers(view, 0.5)
@@ -274,15 +274,15 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
 def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[int] = []
 
-    def recorded(scene: Scene, views: list[TrainingView], *rest: Any, **options: Any) -> list[Fit]:
+    def recorded(scene: Scene, views: list[TrainingView], *rest: Any, **options: Any) -> list[ViewPsnr]:
         compared.extend(view.frame_id for view in views)
         return evaluate_views(scene, views, *rest, **options)
 
-    monkeypatch.setattr("cleargs.rivr.distillation.MAX_EVALUATED", 3)
-    monkeypatch.setattr("cleargs.rivr.distillation.evaluate_views", recorded)
+    monkeypatch.setattr("cleargs.scene.viewer.MAX_EVALUATED", 3)
+    monkeypatch.setattr("cleargs.scene.viewer.evaluate_views", recorded)
     supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
     views = [view for _, view in sorted(supervision.views.items())][:7]
-    assert TrainedScene(capture.root / "g0").psnr_unseen(views) is not None
+    assert SceneViewer(capture.root / "g0").psnr_unseen(views) is not None
     assert compared == [views[0].frame_id, views[3].frame_id, views[6].frame_id]
 
 
@@ -510,8 +510,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
         ("cleargs.splat.trainer.Trainer.step", 12),  # after it, before its files
         ("cleargs.splat.trainer.Trainer.step", 20),  # inside the distillation of round 2
         ("cleargs.splat.trainer.Trainer.step", 30),  # inside the consolidation
-        ("cleargs.rivr.distillation.write_ply", 1),  # the last file of round 2
-        ("cleargs.rivr.distillation._copy", 1),  # while publishing
+        ("cleargs.splat.ply.write_ply", 1),  # the last file of round 2
+        ("cleargs.scene.folder._copy", 1),  # while publishing
     ],
 )
 def test_a_killed_run_goes_on_to_the_same_files(

@@ -19,9 +19,10 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.observed import Fit, evaluate_views, pooled_unseen, render_observed
+from cleargs.formation.observed import render_observed
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
+from cleargs.scene.measure import ViewPsnr, evaluate_views, pooled_unseen
 from cleargs.splat import trainer as trainer_module
 from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
@@ -462,7 +463,7 @@ def test_unseen_pixels_measure_quality_without_training(pictures: list[np.ndarra
     assert pooled_unseen(seen) == pytest.approx(
         -10 * np.log10(np.mean([0.1 ** (fit.unseen / 10) for fit in seen]))
     )
-    assert pooled_unseen([Fit(20.0, None)]) is None
+    assert pooled_unseen([ViewPsnr(20.0, None)]) is None
 
 
 def test_one_percent_of_each_frame_is_unseen() -> None:
