@@ -30,7 +30,7 @@ def train_into(
     label: str,
     device: str,
     round: int = 0,
-    **options: Any,  # of `Trainer`
+    **options: Any,  # for `Trainer`
 ) -> Dusted:
     """Train a scene, remove its dust and write the files of `SceneFolder` into ``folder``."""
     trainer = Trainer(scene, views, config, formation=formation, device=device, **options)
