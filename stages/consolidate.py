@@ -68,8 +68,8 @@ def preflight(config: ConsolidateConfig) -> None:
 
 
 def idle(sections: Mapping[str, Any]) -> bool:
-    """Return True for a draft, which makes no repairs."""
-    return bool(sections["g0"].quality == "draft")
+    """Return True if no repair is made."""
+    return bool(sections["rivr"].rounds == 0)
 
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
@@ -98,7 +98,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     rivr, harm = context.inputs["rivr"], context.settings["rivr"].harm
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.held_back)
-    if context.settings["g0"].quality == "draft":
+    if idle(context.settings):
         return _unchanged(context)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     rows = tables.read_selection(rivr / "selection.parquet")
@@ -152,10 +152,10 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
 
 
 def _unchanged(context: StageContext[ConsolidateConfig]) -> StageResult:
-    """Publish G0's scene unchanged: a draft makes no repairs."""
+    """Publish G0's scene unchanged."""
     from cleargs.rivr.tables import write_repairs
 
-    context.reporter.info("consolidation: a draft trains no further; the scene is G0's, unchanged")
+    context.reporter.info("consolidation: without repairs, the scene is G0's, unchanged")
     write_repairs(context.out / "repairs.parquet", [])
     SceneFolder(context.inputs["g0"]).publish([], context.out, None)
-    return StageResult(summary={"repairs": 0, "published": "G0", "draft": True})
+    return StageResult(summary={"repairs": 0, "published": "G0"})

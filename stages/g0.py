@@ -13,12 +13,6 @@ from cleargs.types import Device
 
 from .config import G0Config
 
-
-def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
-    """Return the settings. In a draft, this training ends the schedule, because no other training follows."""
-    return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
-
-
 VERSION = 47
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
@@ -108,7 +102,6 @@ def run(context: StageContext[G0Config]) -> StageResult:
         exposure=exposure,
         lr_exposure=config.lr_exposure,
         tolerance=TOLERANCE if movement_expected(config, allocation) else 0.0,
-        draft=config.quality == "draft",
         measured=load_paths(ingest),
     )
     trained, dropped, few, fits = train_into(

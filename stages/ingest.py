@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field, field_validator
 
@@ -54,18 +53,6 @@ class IngestConfig(SfmConfig, CaptureConfig):
 
 FEW_FRAMES = 20
 """Number of frames below which a warning is given."""
-
-DRAFT_FRAMES, DRAFT_SIZE = 60, 640
-"""Maximum number of frames in a draft, and maximum long side of its images, px."""
-
-
-def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig:
-    """Return the settings, limited to `DRAFT_FRAMES` and `DRAFT_SIZE` if the run is a draft."""
-    if getattr(sections.get("g0"), "quality", None) != "draft":
-        return config
-    frames, size = min(config.max_frames, DRAFT_FRAMES), min(config.max_size, DRAFT_SIZE)
-    return config.model_copy(update={"max_frames": frames, "max_size": size})
-
 
 VERSION = 21
 CONFIG = IngestConfig

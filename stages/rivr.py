@@ -41,7 +41,12 @@ class RoundsConfig(DistilConfig):
 class RivrConfig(RepairConfig):
     """Render-Guided In-Video Restoration."""
 
-    rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="rounds in which every target frame is repaired")
+    rounds: int = Field(
+        2,
+        ge=0,
+        le=MAX_ROUNDS,
+        description="rounds in which every target frame is repaired; 0: no repairs, the scene is that of g0",
+    )
     targets: Literal["auto", "all"] = Field(
         "auto",
         description="frames to repair: all registered training frames; auto = those that image formation and "
@@ -129,8 +134,8 @@ def preflight(config: RivrConfig) -> None:
 
 
 def idle(sections: Mapping[str, Any]) -> bool:
-    """Return True for a draft, which makes no repairs."""
-    return bool(sections["g0"].quality == "draft")
+    """Return True if no repair is made."""
+    return bool(sections["rivr"].rounds == 0)
 
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
@@ -143,7 +148,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 
     config, g0 = context.config, context.settings["g0"]
     frames, megapixels = capture_size(context)
-    if idle(context.settings):
+    if config.rounds == 0:
         return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
     targets = frames if config.targets == "all" else max(2, round(AUTO_SHARE * frames))
     deblurs = config.use_observation and config.undo_motion
@@ -177,7 +182,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
     measured = load_paths(context.inputs["ingest"])
     g0 = SceneViewer(context.inputs["g0"], context.device, measured)
-    if context.settings["g0"].quality == "draft":
+    if config.rounds == 0:
         return _unchanged(context, supervision, g0)
     chosen = frames_to_repair(config.targets, supervision, g0.formations)
     targets = [supervision.views[frame_id] for frame_id in chosen]
@@ -295,11 +300,11 @@ def _repair_and_distil(
 
 
 def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: SceneViewer) -> StageResult:
-    """Publish G0's scene unchanged: a draft makes no repairs."""
+    """Publish G0's scene unchanged."""
     from cleargs.rivr.tables import Selection, write_selection
 
-    context.reporter.info("RIVR: no repairs in a draft: the scene of G0 stays as it is")
-    rows = [Selection.not_tried(frame_id, "not tried: a draft") for frame_id in supervision.views]
+    context.reporter.info("RIVR: no repairs are made: the scene of G0 stays as it is")
+    rows = [Selection.not_tried(frame_id, "not tried: no repairs are made") for frame_id in supervision.views]
     write_selection(context.out / "selection.parquet", rows)
     g0.files.publish([], context.out, None)
-    return StageResult(summary={"rounds": [], "published": "G0", "draft": True})
+    return StageResult(summary={"rounds": [], "published": "G0"})

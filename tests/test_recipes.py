@@ -250,6 +250,11 @@ def test_a_draft_limits_the_capture_and_trains_g0_to_its_end() -> None:
     assert (asked["ingest"].max_frames, asked["ingest"].max_size) == (200, 960)
     assert (used["ingest"].max_frames, used["ingest"].max_size) == (60, 640)
     assert asked["g0"].end < 1.0 and used["g0"].end == 1.0
+    assert (asked["rivr"].rounds, used["rivr"].rounds) == (2, 0)
+    assert (
+        load_config(installed(), "draft").effective
+        == load_config(installed(), overrides=["g0.quality=draft"]).effective
+    )
     smaller: Any = load_config(installed(), "smoke", ["g0.quality=draft"]).effective
     assert (smaller["ingest"].max_frames, smaller["ingest"].max_size) == (24, 480)
 

@@ -61,7 +61,7 @@ class RunSpec:
     """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
 
     def stages(self, dag: Dag) -> tuple[str, ...]:
-        """Return the stages that have work with the settings of the run: a draft has no repairs."""
+        """Return the stages that have work with the settings of the run."""
         idle = {name: getattr(dag.load(name), "idle", None) for name in dag.names}
         return tuple(name for name, check in idle.items() if not (check and check(self.config.effective)))
 

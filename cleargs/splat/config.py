@@ -60,6 +60,10 @@ class FormationConfig(FrozenModel):
     every: int = Field(
         10, ge=1, description="training steps on a frame between two estimates of its image formation"
     )
+    first_search: bool = Field(
+        True,
+        description="search every frame for blur once; false: only frames in which a short test finds blur",
+    )
     pose: Literal["auto", "on", "off"] = Field(
         "auto",
         description="correct the pose of a frame together with its motion; auto = where ingest found or "
@@ -99,7 +103,8 @@ class TrainConfig(FrozenModel):
         "standard",
         description="size of all trainings if steps and budget are unset: draft has a quarter of the steps "
         "of standard and half of its maximum number of Gaussians; high has 4 times the steps and twice the "
-        "Gaussians. A draft also has no more than 60 frames of 640 px, ends with G0 and makes no repairs",
+        "Gaussians. A draft also follows the recipe draft: at most 60 frames of 640 px, and no repairs",
+        json_schema_extra={"recipes": ["draft"]},
     )
     steps: int | None = Field(
         None,

@@ -421,15 +421,16 @@ def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> Non
     assert result.summary["repairs"] == len(TARGETS) - 1
 
 
-def test_a_draft_publishes_the_first_scene_unchanged(capture: Capture) -> None:
-    draft = tiny_g0(quality="draft")
-    first = capture.context("rivr", tiny_rivr(), g0=draft)
+def test_without_rounds_the_first_scene_stays(capture: Capture) -> None:
+    first = capture.context("rivr", tiny_rivr(rounds=0))
     assert rivr.run(first).summary["published"] == "G0"
     rows = read_selection(first.out / "selection.parquet")
     assert [row.frame_id for row in rows] == list(range(len(ROLES)))
-    assert {(row.exr, row.chosen, row.reason) for row in rows} == {(None, "observed", "not tried: a draft")}
-    second = capture.context("consolidate", tiny_consolidate(), g0=draft)
-    assert consolidate.run(second).summary == {"repairs": 0, "published": "G0", "draft": True}
+    assert {(row.exr, row.chosen, row.reason) for row in rows} == {
+        (None, "observed", "not tried: no repairs are made")
+    }
+    second = capture.context("consolidate", tiny_consolidate(), rivr=tiny_rivr(rounds=0))
+    assert consolidate.run(second).summary == {"repairs": 0, "published": "G0"}
     for context, stage in ((first, rivr), (second, consolidate)):
         assert same_scene(context.out, capture.root / "g0")
         assert set(stage.OUTPUTS) <= {path.name for path in context.out.iterdir()}
