@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +89,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.rivr import tables
     from cleargs.rivr.distillation import check_harm, distil
     from cleargs.rivr.rounds import pseudo_view
+    from cleargs.rivr.summaries import ConsolidateSummary
     from cleargs.rivr.targets import load_supervision
     from cleargs.scene.viewer import SceneViewer
     from cleargs.splat.backend import set_threads
@@ -97,7 +97,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     config, threads, reporter = context.config, context.threads, context.reporter
     rivr, harm = context.inputs["rivr"], context.settings["rivr"].harm
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.held_back)
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.control)
     if idle(context.settings):
         return _unchanged(context)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
@@ -139,23 +139,24 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
 
     better = "consolidated scene" if checked.harm is None else "RIVR's scene"
     return StageResult(
-        summary={
-            "repairs": len(repairs),
-            "chosen": tables.chosen_counts(repairs) | {"observed": len(unrepaired)},
-            "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
-            "scorer": scorer.name,
-            "held_back": asdict(checked),
-            "published": better if repairs or kept else "G0",
-            "psnr_unseen": final.psnr_unseen(supervision.real),
-        }
+        summary=ConsolidateSummary(
+            repairs=len(repairs),
+            chosen=tables.chosen_counts(repairs) | {"observed": len(unrepaired)},
+            latest_rounds=dict(sorted(Counter(str(row.round) for row in repairs).items())),
+            scorer=scorer.name,
+            control=checked,
+            published=better if repairs or kept else "G0",
+            psnr_unseen=final.psnr_unseen(supervision.real),
+        ).figures()
     )
 
 
 def _unchanged(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Publish G0's scene unchanged."""
+    from cleargs.rivr.summaries import ConsolidateSummary
     from cleargs.rivr.tables import write_repairs
 
     context.reporter.info("consolidation: without repairs, the scene is G0's, unchanged")
     write_repairs(context.out / "repairs.parquet", [])
     SceneFolder(context.inputs["g0"]).publish([], context.out, None)
-    return StageResult(summary={"repairs": 0, "published": "G0"})
+    return StageResult(summary=ConsolidateSummary(repairs=0, published="G0").figures())

@@ -64,6 +64,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.measured import load_paths
     from cleargs.formation.movement import TOLERANCE
     from cleargs.parquet import read_table
+    from cleargs.rivr.summaries import G0Summary
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
     from cleargs.scene.measure import pooled_unseen
     from cleargs.scene.training import train_into
@@ -120,21 +121,21 @@ def run(context: StageContext[G0Config]) -> StageResult:
     psnr = {view.frame_id: fit.psnr for view, fit in zip(few, fits, strict=True)}
     strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
     return StageResult(
-        summary={
-            "views": len(views),
-            "gaussians_start": gaussians.num,
-            "gaussians": trained.scene.gaussians.num,
-            "gaussians_dropped": dropped,
-            "steps": config.length,
-            "sh_degree": gaussians.sh_degree,
-            "exposure": exposure is not None,
-            "exposure_spread": exposure_spread,
-            "colour_spread": colour_spread,
-            "moving_share": sum(float(cells.mean()) for cells in formation.moving.values()) / len(views),
-            "psnr_strong": mean_psnr(psnr[frame_id] for frame_id in strong if frame_id in psnr),
-            "psnr_active": mean_psnr(psnr.values()),
-            "psnr_unseen": pooled_unseen(fits),
-        }
+        summary=G0Summary(
+            views=len(views),
+            gaussians_start=gaussians.num,
+            gaussians=trained.scene.gaussians.num,
+            gaussians_dropped=dropped,
+            steps=config.length,
+            sh_degree=gaussians.sh_degree,
+            exposure=exposure is not None,
+            exposure_spread=exposure_spread,
+            colour_spread=colour_spread,
+            moving_share=sum(float(cells.mean()) for cells in formation.moving.values()) / len(views),
+            psnr_strong=mean_psnr(psnr[frame_id] for frame_id in strong if frame_id in psnr),
+            psnr_active=mean_psnr(psnr.values()),
+            psnr_unseen=pooled_unseen(fits),
+        ).figures()
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -172,6 +172,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.rivr.distillation import check_harm
     from cleargs.rivr.need import frames_to_repair, rows_of_others
     from cleargs.rivr.rounds import RepairContext, forget_others
+    from cleargs.rivr.summaries import RivrSummary
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
     from cleargs.scene.viewer import SceneViewer
@@ -179,7 +180,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
 
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.control)
     measured = load_paths(context.inputs["ingest"])
     g0 = SceneViewer(context.inputs["g0"], context.device, measured)
     if config.rounds == 0:
@@ -215,13 +216,13 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     final, rejected = (current, None) if checked.harm is None else (g0, current.files)
     final.files.publish(trainings, context.out, rejected)
     return StageResult(
-        summary={
-            "expert": expert.name,
-            "rounds": [round_figures(number, rows) for number in sorted({row.round for row in rows})],
-            "held_back": asdict(checked),
-            "published": "distilled scene" if checked.harm is None else "G0",
-            "psnr_unseen": final.psnr_unseen(supervision.real),
-        }
+        summary=RivrSummary(
+            expert=expert.name,
+            rounds=[round_figures(number, rows) for number in sorted({row.round for row in rows})],
+            control=checked,
+            published="distilled scene" if checked.harm is None else "G0",
+            psnr_unseen=final.psnr_unseen(supervision.real),
+        ).figures()
     )
 
 
@@ -301,10 +302,11 @@ def _repair_and_distil(
 
 def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: SceneViewer) -> StageResult:
     """Publish G0's scene unchanged."""
+    from cleargs.rivr.summaries import RivrSummary
     from cleargs.rivr.tables import Selection, write_selection
 
     context.reporter.info("RIVR: no repairs are made: the scene of G0 stays as it is")
     rows = [Selection.not_tried(frame_id, "not tried: no repairs are made") for frame_id in supervision.views]
     write_selection(context.out / "selection.parquet", rows)
     g0.files.publish([], context.out, None)
-    return StageResult(summary={"rounds": [], "published": "G0"})
+    return StageResult(summary=RivrSummary(rounds=[], published="G0").figures())

@@ -28,7 +28,7 @@ METHOD: dict[str, Any] = {
     "rva.coverage": True,
     "rva.active_share": 0.0,  # suppressed frames stay suppressed
     "rivr.targets": "all",
-    "rivr.harm.held_back": 0.0,  # every frame is a target, no veto
+    "rivr.harm.control": 0.0,  # every frame is a target, no veto
     "rivr.group": 8,  # along the trajectory
     "rivr.use_observation": True,
     "rivr.undo_motion": False,

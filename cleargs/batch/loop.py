@@ -25,6 +25,7 @@ from rich.filesize import decimal
 
 from cleargs.batch.sheet import SceneJob, SheetError
 from cleargs.capture.sources import whole_capture
+from cleargs.capture.summary import IngestSummary
 from cleargs.errors import CleargsError, InputError, listed
 from cleargs.files import write_bytes
 from cleargs.own_files import refuse_links
@@ -39,6 +40,7 @@ from cleargs.progress import Reporter, SilentReporter
 from cleargs.render import TARGETS
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
+from cleargs.rivr.summaries import TrainingSummary
 from cleargs.safe_io import read_bytes
 from cleargs.subprocesses import module_command
 from cleargs.types import Device
@@ -246,14 +248,14 @@ class Batch:
     def result(self, scene: SceneJob) -> Result:
         """Return the present state and figures of ``scene``."""
         made = linked_manifests(self.run_folder(scene), self.dag.names)
-        ingest = made["ingest"].summary if "ingest" in made else {}
-        psnr = [manifest.summary.get("psnr_unseen") for manifest in made.values()]
+        ingest = IngestSummary.of(made.get("ingest"))
+        psnr = [TrainingSummary.of(manifest).psnr_unseen for manifest in made.values()]
         state, cause = self._state(scene)
         return Result(
             scene=scene.name,
             state=state,
-            frames=ingest.get("frames"),
-            frames_placed=ingest.get("registered"),
+            frames=ingest.frames,
+            frames_placed=ingest.registered,
             psnr_unseen=next((value for value in reversed(psnr) if value is not None), None),
             minutes=round(sum(manifest.seconds for manifest in made.values()) / 60, 2),
             memory_gb=max((manifest.peak_memory_gb or 0.0 for manifest in made.values()), default=0.0),

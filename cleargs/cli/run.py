@@ -376,7 +376,7 @@ def _quality(summaries: Summaries) -> str:
         f"PSNR {figures['psnr_unseen']:.1f} dB{compared} on pixels that no training saw; "
         "views off the camera path are worse"
     )
-    harm = figures.get("held_back", {}).get("harm")
+    harm = figures.get("control", {}).get("harm")
     return f"{text}. Rejected: {harm}" if harm else text
 
 

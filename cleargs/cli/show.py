@@ -66,7 +66,7 @@ LABELS: Mapping[str, str] = {
     "repairs_refused": "repairs refused by the gate",
     "tie_breaks": "choices by the tie-break scorer",
     "latest_rounds": "repairs by round",
-    "held_back": "control frames",
+    "control": "control frames",
 }
 """Figure of a manifest -> its label, if its name is not clear."""
 

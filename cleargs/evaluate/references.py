@@ -19,6 +19,7 @@ from cleargs.capture.cutouts import are_cut_outs, over_white
 from cleargs.capture.folders import chosen, name_below_images, natural_key
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.prepare import is_as_stored, read_image, read_stencil
+from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
@@ -140,7 +141,8 @@ def reference_of(
                 reporter.warn(f"{missing} of {len(listed)} references match no frame: left out")
             alignment = Alignment(world="scene", matched=len(views))
         else:
-            if manifest.summary.get("poses") in ("sfm", "refined"):
+            ingested = IngestSummary.of(manifest)
+            if ingested.poses in ("sfm", "adjusted"):
                 observed = directory.parent / "observed"  # synthetic captures have it
                 if align is None and (observed / "transforms.json").is_file():
                     align = observed
@@ -150,7 +152,7 @@ def reference_of(
                 similarity, alignment = align_cameras(theirs, ours)
                 _report_fit(alignment, align or directory, reporter)
             else:
-                similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
+                similarity = Similarity.from_json(ingested.similarity, ingest)
                 theirs = [similarity.pose(view.pose) for view in listed.values()]
                 _require_one_unit(theirs, [*own.values()], _points(ingest))
             views = [

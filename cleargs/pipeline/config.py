@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.settings import Setting, fields_of, flattened, settings_of, suggestion
+from cleargs.pipeline.settings import Setting, fields_of, flattened, former_names, settings_of, suggestion
 from cleargs.safe_io import FAULTS, faults_as, read_text
 
 RECIPES = "cleargs.workflows"
@@ -202,11 +202,12 @@ def _known(table: Any, model: Any, place: str, others: list[str]) -> Any:
     """Return ``table`` without the settings that ``model`` does not have, which are added to ``others``."""
     if not (isinstance(table, dict) and isinstance(model, type) and issubclass(model, BaseModel)):
         return table
-    others += [f"{place}.{name}" for name in table if name not in model.model_fields]
+    names = {old: name for name, field in model.model_fields.items() for old in (name, *former_names(field))}
+    others += [f"{place}.{name}" for name in table if name not in names]
     return {
-        name: _known(table[name], field.annotation, f"{place}.{name}", others)
-        for name, field in model.model_fields.items()
-        if name in table
+        names[name]: _known(value, model.model_fields[names[name]].annotation, f"{place}.{name}", others)
+        for name, value in table.items()
+        if name in names
     }
 
 

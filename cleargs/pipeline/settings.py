@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel
+from pydantic import AliasChoices, BaseModel
 from pydantic.fields import FieldInfo
 
 TYPE_NAMES: Mapping[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
@@ -65,6 +65,12 @@ def fields_of(model: BaseModel, prefix: str = "") -> Iterator[tuple[str, FieldIn
             yield from fields_of(value, f"{prefix}{name}.")
         else:
             yield prefix + name, field, value
+
+
+def former_names(field: FieldInfo) -> list[str]:
+    """Return the names that a setting had in older versions, which are still read."""
+    alias = field.validation_alias
+    return [str(name) for name in alias.choices[1:]] if isinstance(alias, AliasChoices) else []
 
 
 def flattened(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Similarity, upright
 from cleargs.capture.model import read_model, transform_model, write_model
+from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.digest import named_files
 from cleargs.errors import InputError
@@ -204,7 +205,7 @@ def _similarity(
     similarity: dict[str, Any] = {}
     if options.world == "input":
         manifest = linked_manifest(ingest.parent, ingest.name)
-        world = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
+        world = Similarity.from_json(IngestSummary.of(manifest).similarity, ingest)
         similarity = {"scale": world.scale, "rotation": world.rotation.T, "translation": world.origin}
     else:
         stand = np.eye(3) if options.upright is None else upright(_direction(options.upright, cameras))

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
+from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest
@@ -141,7 +142,7 @@ def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
     filmed: list[Frame] = []
     if options.poses is not None:
         manifest = linked_manifest(ingest.parent, ingest.name)
-        similarity = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
+        similarity = Similarity.from_json(IngestSummary.of(manifest).similarity, ingest)
         cameras = read_poses(options.poses, lens, similarity, options.world)
     elif options.turntable:
         cameras = [replace(lens, world_to_camera=pose) for pose in turntable(own, count)]

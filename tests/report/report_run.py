@@ -94,7 +94,7 @@ class FinishedRun:
         self._trained("g0", g0)
         self._rivr()
         held = {"frames": [0], "harm": None, "psnr_before": 24.0, "psnr_after": 25.5}
-        consolidated = {"repairs": 5, "published": "consolidated scene", "held_back": held}
+        consolidated = {"repairs": 5, "published": "consolidated scene", "control": held}
         self._trained("consolidate", consolidated | {"psnr_unseen": 24.6})
 
     def planner(self, store: Store) -> Planner:

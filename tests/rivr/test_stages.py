@@ -135,7 +135,7 @@ def test_every_round_repairs_every_target(capture: Capture, expert: Sharpen) -> 
     # The held-back frame goes on supervising as it did for G0.
     assert {frame_id for frame_id, kind in drawn if kind == "real"} <= {0, 2, HELD_BACK, 4, 5, 6}
     summary = result.summary
-    assert summary["held_back"]["frames"] == [HELD_BACK]
+    assert summary["control"]["frames"] == [HELD_BACK]
     assert sum(summary["rounds"][0]["chosen"].values()) == len(TARGETS)
     assert summary["published"] == "distilled scene"
 
@@ -323,7 +323,7 @@ def test_where_every_frame_is_kept_the_scene_trains_on_raw_frames(capture: Captu
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     assert len(log["kind"]) == 12 and set(log["kind"]) == {"real"}
     assert (summary["repairs"], summary["chosen"]["observed"]) == (0, len(TARGETS))
-    assert summary["held_back"]["frames"] == []  # no repair can have done harm
+    assert summary["control"]["frames"] == []  # no repair can have done harm
 
 
 def test_the_latest_round_decides_whether_a_frame_is_repaired(capture: Capture) -> None:
@@ -394,7 +394,7 @@ def test_harm_keeps_the_better_scene(capture: Capture, stage: str) -> None:
         result = consolidate.run(context)
     assert same_scene(context.out, better)
     assert (context.out / "rejected.ply").read_bytes() != (context.out / "scene.ply").read_bytes()
-    checked = result.summary["held_back"]
+    checked = result.summary["control"]
     assert "PSNR fell" in checked["harm"]
     assert checked["psnr_after"] < checked["psnr_before"] - 0.5
 
@@ -449,7 +449,7 @@ def test_a_round_in_which_nothing_is_taken_ends_the_rounds(
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     assert len(log["frame_id"]) == 3 * 12 and set(log["kind"]) == {"real"}
     assert any("no candidate is taken" in line for line in lines)
-    assert result.summary["held_back"]["frames"] == []  # no repair can have done harm
+    assert result.summary["control"]["frames"] == []  # no repair can have done harm
 
 
 def test_consolidation_without_repairs_is_g0_byte_for_byte(capture: Capture) -> None:
