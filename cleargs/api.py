@@ -16,8 +16,8 @@ from cleargs.api_parts import Progress, reporter_of, save
 from cleargs.capture.sources import whole_capture
 from cleargs.errors import InputError
 from cleargs.packed import require_images
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
+from cleargs.pipeline.stages import installed
 from cleargs.progress import log_reporter
 from cleargs.run_results import SCENE, Run, open_prepared, open_run, scene_stage
 from cleargs.splat.config import Quality

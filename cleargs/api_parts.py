@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.session import usable_cores
+from cleargs.pipeline.stages import installed
 from cleargs.progress import PREVIEW, LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import Prepared
 from cleargs.splat.budget import resolve_config

@@ -12,9 +12,9 @@ from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest, has_results, linked_manifest
 from cleargs.own_files import refuse_links
 from cleargs.packed import read_pack, require_images
-from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_metadata, read_run_file, require_store
+from cleargs.pipeline.stages import Stages, installed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from cleargs.splat.views import TrainingView, ViewDataset
 
 
-def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
+def scene_stage(dag: Stages, run: Path, chosen: str | None) -> str:
     """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
     if run.is_file():
         raise InputError("--stage chooses among the scenes of a run", hint="leave it out for a file")
@@ -40,7 +40,7 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     raise InputError(message, hint=f"see cleargs status {run}{others}")
 
 
-def check_results(dag: Dag, run: Path) -> None:
+def check_results(dag: Stages, run: Path) -> None:
     """Raise StoreError if results in ``run`` are behind a link that the store did not make, or have one."""
     if read_pack(run) is not None:
         refuse_links([run / SCENE])

@@ -15,8 +15,8 @@ from cleargs.errors import ConfigError, InputError, StoreError
 from cleargs.models.expert import load_expert
 from cleargs.models.scorer import load_scorer
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import plugin_versions
+from cleargs.pipeline.stages import installed
 from cleargs.plugins import plugins
 from cleargs.progress import SilentReporter
 from cleargs.rivr.candidates import Materials, candidate

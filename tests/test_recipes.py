@@ -17,7 +17,7 @@ from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError, InputError
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import Config, load_config
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 from cleargs.rva.evaluators import check_evaluator
 from cleargs.splat.config import FormationConfig
 from cleargs.stages.rva import RvaConfig

@@ -29,12 +29,12 @@ from cleargs.capture.summary import IngestSummary
 from cleargs.errors import CleargsError, InputError, listed
 from cleargs.files import write_bytes
 from cleargs.own_files import refuse_links
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import Place
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import is_store, visible_names
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.render import TARGETS
@@ -91,7 +91,7 @@ class Result:
 class Batch:
     """The scenes of a sheet, and the options with which they run."""
 
-    dag: Dag
+    dag: Stages
     folder: Path
     """Absolute path of the batch."""
     scenes: Sequence[SceneJob]

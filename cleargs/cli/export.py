@@ -11,7 +11,7 @@ import click
 from cleargs.cli.common import FILE, answer, json_option, quiet_option, scene_argument, scene_option
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
-from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.stages import Stages
 from cleargs.render import TARGETS
 from cleargs.run_results import scene_stage
 
@@ -130,7 +130,7 @@ Programs of --for:
 @quiet_option
 @click.pass_obj
 def export(
-    dag: Dag,
+    dag: Stages,
     /,
     run: Path,
     chosen: str | None,

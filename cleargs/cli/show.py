@@ -28,10 +28,10 @@ from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.packed import WORKS, read_pack
 from cleargs.parquet import meanings, read_any_table, read_table
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RunSpec, read_run_file
+from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import linked_manifests
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ Examples:
 @json_option
 @click.pass_obj
 def show(
-    dag: Dag,
+    dag: Stages,
     run: Path,
     stage: str | None,
     columns: bool,
@@ -158,7 +158,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
             click.echo(f"preview: {preview.path}")
 
 
-def _show_extent(dag: Dag, run: Path, as_json: bool) -> None:
+def _show_extent(dag: Stages, run: Path, as_json: bool) -> None:
     """Print the scene's box, in the coordinates of the exports that turn nothing."""
     from cleargs.render.pruning import extent_text
     from cleargs.run_results import scene_path, scene_stage

@@ -16,8 +16,8 @@ from typing import Any, cast
 from pydantic import BaseModel, ValidationError
 
 from cleargs.errors import ConfigError, did_you_mean
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import Setting, fields_of, flattened, former_names, settings_of, suggestion
+from cleargs.pipeline.stages import Stages
 from cleargs.safe_io import FAULTS, faults_as, read_text
 
 RECIPES = "cleargs.workflows"
@@ -54,7 +54,7 @@ class Config:
 
 
 def load_config(
-    dag: Dag, recipe: str | Document = "default", overrides: Sequence[str] = (), seed: int | None = None
+    dag: Stages, recipe: str | Document = "default", overrides: Sequence[str] = (), seed: int | None = None
 ) -> Config:
     """Return the checked configuration of a recipe: a name, the path of a TOML file, or a document.
 
@@ -132,7 +132,7 @@ def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> Document:
     return merged
 
 
-def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
+def check_document(dag: Stages, document: Mapping[str, Any]) -> Config:
     """Check a document with the stages' models and fill in the defaults. Raises ConfigError."""
     seed = document.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
@@ -184,7 +184,7 @@ def _checked(models: Mapping[str, type[BaseModel]], document: Mapping[str, Any])
     return sections
 
 
-def known_settings(dag: Dag, document: Mapping[str, Any]) -> tuple[Document, list[str]]:
+def known_settings(dag: Stages, document: Mapping[str, Any]) -> tuple[Document, list[str]]:
     """Return the settings of ``document`` that this version has, and the names of the others.
 
     The file of a run that another version wrote may have others.

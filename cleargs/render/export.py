@@ -22,8 +22,8 @@ from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_bytes, write_json
 from cleargs.manifest import linked_manifest
 from cleargs.named_views import NamedView, read_views
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
+from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.run_results import scene_path

@@ -18,8 +18,8 @@ from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
 from cleargs.packed import require_images
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
+from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.render.output import Kind, Shot, kind_of, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable

@@ -19,10 +19,10 @@ from cleargs.capture.summary import IngestSummary
 from cleargs.errors import CleargsError
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config, load_config, recipe_names
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
+from cleargs.pipeline.stages import Stages
 from cleargs.program import program
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import count
@@ -77,7 +77,7 @@ def shown_advice(
     ]
 
 
-def command(run: RunSpec, dag: Dag) -> str:
+def command(run: RunSpec, dag: Stages) -> str:
     """Return the ``cleargs run`` command that reproduces a run, as called in the parent of its folder."""
     recipe, changed = _nearest_recipe(run.config, dag)
     words = ["--recipe", recipe] if recipe != "default" else []
@@ -92,7 +92,7 @@ def _command(run: RunSpec, options: Sequence[str]) -> str:
     return f"{program(place)} {shlex.join(words)}"
 
 
-def _nearest_recipe(config: Config, dag: Dag) -> tuple[str, dict[str, Any]]:
+def _nearest_recipe(config: Config, dag: Stages) -> tuple[str, dict[str, Any]]:
     """Return the recipe from which the fewest settings differ, and these settings."""
     settings = dict(flattened(config.document()))
     candidates = []

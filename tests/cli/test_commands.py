@@ -23,9 +23,9 @@ from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import default_folder, usable_cores
+from cleargs.pipeline.stages import installed
 
 
 @pytest.fixture
@@ -345,7 +345,7 @@ def test_installed_stages_load_light() -> None:
     """Planning loads every stage module; a run with nothing to do must not pay for what `run` needs."""
     heavy = {"torch", "numba", "pycolmap", "cv2", "onnxruntime", "scipy"}
     program = (
-        "import sys; from cleargs.pipeline.dag import installed\n"
+        "import sys; from cleargs.pipeline.stages import installed\n"
         "from cleargs.pipeline.config import load_config\n"
         f"load_config(installed()); print(sorted({heavy!r} & set(sys.modules)))"
     )

@@ -10,10 +10,10 @@ from toy import Remarks
 
 from cleargs.errors import ConfigError
 from cleargs.pipeline.config import check_document, known_settings, load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.run_file import RUN_FILE, read_run_file
 from cleargs.pipeline.session import resolve_run
 from cleargs.pipeline.settings import settings_of
+from cleargs.pipeline.stages import installed
 
 OLD = (Path(__file__).with_name("old_run.toml")).read_text()
 """The recipe smoke as written by version 0.2.0: 190 settings, with those of a training in three tables."""

@@ -18,10 +18,10 @@ from cleargs.media.exr import LayeredImage, to_layer, write_exr
 from cleargs.media.image import write_rgb
 from cleargs.parquet import write_table
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec, write_run_file
+from cleargs.pipeline.stages import installed
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
