@@ -16,7 +16,7 @@ from benchmarks.rva.agree_command import agree
 from benchmarks.rva.check_command import check
 from benchmarks.speed.commands import formation, quality, splat, train
 from cleargs.cli import main as program
-from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.stages import Stages
 
 
 @click.group("python -m benchmarks", context_settings={"help_option_names": ["-h", "--help"]})
@@ -54,6 +54,6 @@ def main() -> None:
     program.main(program=benchmarks)
 
 
-def invoke(arguments: list[str], dag: Dag | None = None) -> int:
+def invoke(arguments: list[str], dag: Stages | None = None) -> int:
     """Run one command and return its exit code. Tests give ``dag`` to replace the installed stages."""
     return program.invoke(arguments, dag, benchmarks)

@@ -33,11 +33,11 @@ def formats(runs: Sequence[Path]) -> None:
 
     from cleargs.capture.tables import load_frames
     from cleargs.errors import InputError
-    from cleargs.formation.frames import real_views
     from cleargs.parquet import read_table
-    from cleargs.pipeline.dag import installed
+    from cleargs.pipeline.stages import installed
     from cleargs.render.pruning import training_psnr
     from cleargs.run_results import scene_path, scene_stage
+    from cleargs.scene.views import real_views
     from cleargs.rva.tables import FRAMES
     from cleargs.splat.formats import FORMATS, read_scene, write_scene
     from cleargs.splat.ply import read_ply

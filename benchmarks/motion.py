@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
-from cleargs.formation.frames import camera_of
 from cleargs.formation.measured import load_paths
 from cleargs.formation.motion import TWIST, grid_basis
+from cleargs.scene.views import camera_of
 from cleargs.types import ArrayF64
 
 GRID = (9, 16)

@@ -16,8 +16,8 @@ from cleargs.api_parts import Progress, reporter_of, save
 from cleargs.capture.sources import whole_capture
 from cleargs.errors import InputError
 from cleargs.packed import require_images
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
+from cleargs.pipeline.stages import installed
 from cleargs.progress import log_reporter
 from cleargs.run_results import SCENE, Run, open_prepared, open_run, scene_stage
 from cleargs.splat.config import Quality
@@ -25,7 +25,7 @@ from cleargs.splat.config import Quality
 if TYPE_CHECKING:
     from cleargs.evaluate.config import EvalOptions
     from cleargs.evaluate.eval_report import Evaluation
-    from cleargs.rivr.distillation import Deblurred
+    from cleargs.scene.viewer import Deblurred
     from cleargs.splat.scene import Scene
 
 
@@ -165,15 +165,15 @@ def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | 
         if deblurred is not None:
             print(deblurred.formation.blur_px, deblurred.image.shape)
     """
-    from cleargs.formation.frames import view_of
-    from cleargs.rivr.distillation import TrainedScene
+    from cleargs.scene.viewer import SceneViewer
+    from cleargs.scene.views import view_of
 
     require_images(run.folder, "deblurring")
     capture = open_prepared(run["ingest"])
     frame = next((frame for frame in capture.frames if frame.frame_id == frame_id), None)
     if frame is None or not frame.registered:
         raise InputError(f"frame {frame_id} has no pose", hint="see cleargs show RUN ingest")
-    return TrainedScene(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
+    return SceneViewer(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
 
 
 def evaluate_scene(

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.session import usable_cores
+from cleargs.pipeline.stages import installed
 from cleargs.progress import PREVIEW, LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import Prepared
 from cleargs.splat.budget import resolve_config
@@ -56,7 +56,7 @@ def initialise(
         scene = cg.initialise(capture, config=cg.G0Config(sh_degree=1))
     """
     from cleargs import G0Config
-    from cleargs.formation.frames import seen_points
+    from cleargs.scene.views import seen_points
     from cleargs.splat.initialise import starting_gaussians
     from cleargs.splat.scene import BLACK, Scene
 

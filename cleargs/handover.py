@@ -20,8 +20,8 @@ from cleargs.capture.tables import Frame, Points
 from cleargs.files import whole_folder, write_bytes, write_json
 from cleargs.media.image import to_uint8, write_mask, write_rgb
 from cleargs.packed import require_images
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
+from cleargs.pipeline.stages import installed
 from cleargs.splat.camera import Camera
 
 SPLIT, POINTS = "split.json", "points.ply"

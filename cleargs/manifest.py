@@ -7,14 +7,15 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import to_jsonable_python
 
 import cleargs
 from cleargs.base_model import FrozenModel
 from cleargs.digest import DigestMemo, json_digest
+from cleargs.errors import StoreError
 from cleargs.files import is_partial, write_json
 from cleargs.own_files import has_only_files, regular_files
 from cleargs.safe_io import FAULTS, read_json
@@ -227,6 +228,28 @@ def damages(
             yield f"{name} is missing"
         except OSError as error:
             yield f"{name} cannot be read: {error.strerror or error}"
+
+
+class Summary(BaseModel):
+    """Figures of a stage, which writes those that it sets. A manifest of an older version may have fewer."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    @classmethod
+    def of(cls, manifest: Manifest | None) -> Self:
+        """Return the figures in a manifest; None for all without one. Raises StoreError if one is damaged."""
+        try:
+            return cls.model_validate({} if manifest is None else manifest.summary)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            raise StoreError(
+                f"a figure in the manifest cannot be read: {'.'.join(map(str, first['loc']))}",
+                hint="run the stage again with --force",
+            ) from error
+
+    def figures(self) -> dict[str, Any]:
+        """Return name -> value of the figures that are set."""
+        return self.model_dump(exclude_unset=True)
 
 
 def plain_json(value: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from cleargs.errors import InputError, did_you_mean
 
-ExtensionPoint = Literal["evaluators", "experts", "scorers", "formats", "layouts"]
+ExtensionPoint = Literal["evaluators", "experts", "scorers", "candidates", "densifiers", "formats", "layouts"]
 
 
 def installed_version(distribution: str) -> str:

@@ -12,21 +12,21 @@ from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest, has_results, linked_manifest
 from cleargs.own_files import refuse_links
 from cleargs.packed import read_pack, require_images
-from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.run_file import SCENE as SCENE
 from cleargs.pipeline.run_file import read_metadata, read_run_file, require_store
+from cleargs.pipeline.stages import Stages, installed
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from cleargs.capture.tables import Frame, Points
-    from cleargs.rivr.distillation import Deblurred
+    from cleargs.scene.viewer import Deblurred
     from cleargs.splat.camera import Camera
     from cleargs.splat.scene import Scene
     from cleargs.splat.views import TrainingView, ViewDataset
 
 
-def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
+def scene_stage(dag: Stages, run: Path, chosen: str | None) -> str:
     """Return the stage ``chosen``, or the last stage that has a scene. Raise InputError if there is none."""
     if run.is_file():
         raise InputError("--stage chooses among the scenes of a run", hint="leave it out for a file")
@@ -41,7 +41,7 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     raise InputError(message, hint=f"see cleargs status {run}{others}")
 
 
-def check_results(dag: Dag, run: Path) -> None:
+def check_results(dag: Stages, run: Path) -> None:
     """Raise StoreError if results in ``run`` are behind a link that the store did not make, or have one."""
     if read_pack(run) is not None:
         refuse_links([run / SCENE])
@@ -274,7 +274,7 @@ class Prepared:
         Returns:
             Views that read their images when these are needed.
         """
-        from cleargs.formation.frames import real_views
+        from cleargs.scene.views import real_views
 
         require_images(self.folder.parent, "training")
         given = {frame.frame_id: 1.0 for frame in self.frames} if weights is None else weights
@@ -282,7 +282,7 @@ class Prepared:
 
     def cameras(self) -> dict[int, Camera]:
         """Return frame_id -> camera for all frames with a pose, including held-out frames."""
-        from cleargs.formation.frames import camera_of
+        from cleargs.scene.views import camera_of
 
         posed = (frame for frame in self.frames if frame.registered)
         return {frame.frame_id: camera_of(frame) for frame in posed}

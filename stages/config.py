@@ -9,7 +9,7 @@ from pydantic import Field
 
 from cleargs.base_model import FrozenModel
 from cleargs.plugins import installed_version
-from cleargs.splat.config import TrainConfig, steps_from_frames
+from cleargs.splat.config import OFF, TrainConfig, steps_from_frames
 from cleargs.types import Device
 
 G0_END, ROUNDS_END = 16 / 19, 18 / 19
@@ -17,9 +17,6 @@ G0_END, ROUNDS_END = 16 / 19, 18 / 19
 
 MAX_ROUNDS = 16
 """Maximum number of RIVR's rounds."""
-
-TRAINED = ("scene.ply", "exposure.parquet", "formation.parquet", "movement.parquet", "state.safetensors")
-"""Outputs of a training from which the next training continues."""
 
 REPAIR_LIBRARIES = (
     "torch",
@@ -104,7 +101,7 @@ class DistilConfig(FrozenModel):
             "steps": self.steps or max(1, round(share * steps_from_frames(frames, g0.quality))),
             "begin": self.begin,
             "end": self.end,
-            "densify": self.densify,
+            "densify": g0.densify if self.densify else OFF,
             "opacity_reg": 0.0,
             "scale_reg": 0.0,
         }

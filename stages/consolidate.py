@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,9 @@ from pydantic import Field
 from cleargs.base_model import FrozenModel
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
+from cleargs.scene.folder import LOG, TRAINED, SceneFolder
 
-from .config import MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
+from .config import MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, DistilConfig
 from .config import other_libraries as other_libraries
 
 
@@ -37,7 +37,7 @@ class ConsolidateConfig(FrozenModel):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 50
+VERSION = 51
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -46,7 +46,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "g0": TRAINED,
     "rivr": (*TRAINED, "selection.parquet", *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1))),
 }
-OUTPUTS = (*TRAINED, "train.parquet", "repairs.parquet")
+OUTPUTS = (*TRAINED, LOG, "repairs.parquet")
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = REPAIR_LIBRARIES
 
@@ -67,8 +67,8 @@ def preflight(config: ConsolidateConfig) -> None:
 
 
 def idle(sections: Mapping[str, Any]) -> bool:
-    """Return True for a draft, which makes no repairs."""
-    return bool(sections["g0"].quality == "draft")
+    """Return True if no repair is made."""
+    return bool(sections["rivr"].rounds == 0)
 
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
@@ -87,16 +87,18 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr import tables
-    from cleargs.rivr.distillation import TrainedScene, check_harm, publish
+    from cleargs.rivr.distillation import check_harm, distil
     from cleargs.rivr.rounds import pseudo_view
+    from cleargs.rivr.summaries import ConsolidateSummary
     from cleargs.rivr.targets import load_supervision
+    from cleargs.scene.viewer import SceneViewer
     from cleargs.splat.backend import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
     rivr, harm = context.inputs["rivr"], context.settings["rivr"].harm
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.held_back)
-    if context.settings["g0"].quality == "draft":
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.control)
+    if idle(context.settings):
         return _unchanged(context)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     rows = tables.read_selection(rivr / "selection.parquet")
@@ -105,12 +107,13 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     tables.write_repairs(context.out / "repairs.parquet", repairs)
 
     measured = load_paths(context.inputs["ingest"])
-    g0 = TrainedScene(context.inputs["g0"], context.device, measured)
-    start = TrainedScene(rivr, context.device, measured) if repairs or kept else g0
-    consolidated, trainings = start, []
+    g0 = SceneViewer(context.inputs["g0"], context.device, measured)
+    start = SceneViewer(rivr, context.device, measured) if repairs or kept else g0
+    consolidated, trainings = start, list[SceneFolder]()
     if repairs or kept:
         pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]
-        consolidated = start.trained(
+        consolidated = distil(
+            start,
             [*supervision.real, *pseudo],
             config.distil.applied_to(context.settings["g0"], len(supervision.real)),
             context.checkpoints / "consolidation",
@@ -122,39 +125,38 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             repaired=tables.repaired_share(rows),
             reporter=reporter,
         )
-        trainings.append(consolidated.folder)
+        trainings.append(consolidated.files)
 
     checked = check_harm(
         g0, consolidated, supervision, scorer, harm, threads, repaired=any(row.accepted for row in rows)
     )
-    final, rejected = (consolidated, None) if checked.harm is None else (start, consolidated)
+    final, rejected = (consolidated, None) if checked.harm is None else (start, consolidated.files)
     if rejected is not None:
         reporter.warn(
             f"the consolidated scene is rejected, RIVR's stays: {checked.harm} on the control frames"
         )
-    publish(final, trainings, context.out, rejected)
+    final.files.publish(trainings, context.out, rejected)
 
     better = "consolidated scene" if checked.harm is None else "RIVR's scene"
     return StageResult(
-        summary={
-            "repairs": len(repairs),
-            "chosen": tables.chosen_counts(repairs) | {"observed": len(unrepaired)},
-            "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
-            "scorer": scorer.name,
-            "held_back": asdict(checked),
-            "published": better if repairs or kept else "G0",
-            "psnr_unseen": final.psnr_unseen(supervision.real),
-        }
+        summary=ConsolidateSummary(
+            repairs=len(repairs),
+            chosen=tables.chosen_counts(repairs) | {"observed": len(unrepaired)},
+            latest_rounds=dict(sorted(Counter(str(row.round) for row in repairs).items())),
+            scorer=scorer.name,
+            control=checked,
+            published=better if repairs or kept else "G0",
+            psnr_unseen=final.psnr_unseen(supervision.real),
+        ).figures()
     )
 
 
 def _unchanged(context: StageContext[ConsolidateConfig]) -> StageResult:
-    """Publish G0's scene unchanged: a draft makes no repairs."""
-    from cleargs.rivr.distillation import TrainedScene, publish
+    """Publish G0's scene unchanged."""
+    from cleargs.rivr.summaries import ConsolidateSummary
     from cleargs.rivr.tables import write_repairs
 
-    context.reporter.info("consolidation: a draft trains no further; the scene is G0's, unchanged")
-    g0 = TrainedScene(context.inputs["g0"], context.device)
+    context.reporter.info("consolidation: without repairs, the scene is G0's, unchanged")
     write_repairs(context.out / "repairs.parquet", [])
-    publish(g0, [], context.out, None)
-    return StageResult(summary={"repairs": 0, "published": "G0", "draft": True})
+    SceneFolder(context.inputs["g0"]).publish([], context.out, None)
+    return StageResult(summary=ConsolidateSummary(repairs=0, published="G0").figures())

@@ -8,15 +8,10 @@ from typing import Any
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
+from cleargs.scene.folder import LOG, TRAINED
 from cleargs.types import Device
 
-from .config import TRAINED, G0Config
-
-
-def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
-    """Return the settings. In a draft, this training ends the schedule, because no other training follows."""
-    return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
-
+from .config import G0Config
 
 VERSION = 47
 CONFIG = G0Config
@@ -32,7 +27,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     ),
     "rva": ("frames.parquet",),
 }
-OUTPUTS = (*TRAINED, "train.parquet")
+OUTPUTS = (*TRAINED, LOG)
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
@@ -48,7 +43,10 @@ def externals(config: G0Config, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: G0Config) -> None:
-    """Check nothing: no model is needed."""
+    """Load the strategy of densification. Raises InputError if another package lacks it."""
+    from cleargs.splat.budget import training_cost
+
+    training_cost(config, frames=1, megapixels=0.1, start=1)
 
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
@@ -62,23 +60,19 @@ def run(context: StageContext[G0Config]) -> StageResult:
     """Make Gaussians from the sparse points and train them on the active frames with their RVA weights."""
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.formation.capture import CaptureFormation
-    from cleargs.formation.dust import without_dust
-    from cleargs.formation.exposure import Exposure, frame_gains, gain_spread, write_exposure
-    from cleargs.formation.frames import real_views, seen_points
+    from cleargs.formation.exposure import Exposure, frame_gains, gain_spread
     from cleargs.formation.measured import load_paths
-    from cleargs.formation.movement import TOLERANCE, write_movement
-    from cleargs.formation.observed import pooled_unseen
-    from cleargs.formation.table import write_formation
-    from cleargs.parquet import read_table, write_table
+    from cleargs.formation.movement import TOLERANCE
+    from cleargs.parquet import read_table
+    from cleargs.rivr.summaries import G0Summary
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
+    from cleargs.scene.measure import pooled_unseen
+    from cleargs.scene.training import train_into
+    from cleargs.scene.views import real_views, seen_points
     from cleargs.splat.backend import mean_psnr, set_threads
     from cleargs.splat.budget import resolve_config
     from cleargs.splat.initialise import starting_gaussians
-    from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import BLACK, Scene
-    from cleargs.splat.state import save_state
-    from cleargs.splat.tables import TRAIN
-    from cleargs.splat.trainer import Trainer
     from cleargs.splat.views import require_views
 
     config, ingest = context.config, context.inputs["ingest"]
@@ -86,7 +80,6 @@ def run(context: StageContext[G0Config]) -> StageResult:
     allocation = read_table(context.inputs["rva"] / "frames.parquet", RVA_FRAMES).to_pylist()
     views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
     require_views(views)
-    weights = {view.frame_id: view.weight for view in views}
     sparse = seen_points(load_points(ingest), ingest, views)
 
     config = resolve_config(config, views)
@@ -103,55 +96,46 @@ def run(context: StageContext[G0Config]) -> StageResult:
     exposure_spread, colour_spread = gain_spread(gains)
     alike = exposure_spread <= config.exposure_threshold and colour_spread <= config.colour_threshold
     off = config.exposure == "off" or (config.exposure == "auto" and alike)
-    exposure = None if off else Exposure.from_gains(list(weights), gains)
+    exposure = None if off else Exposure.from_gains([view.frame_id for view in views], gains)
     formation = CaptureFormation(
         views,
         config.formation,
         exposure=exposure,
         lr_exposure=config.lr_exposure,
         tolerance=TOLERANCE if movement_expected(config, allocation) else 0.0,
-        draft=config.quality == "draft",
         measured=load_paths(ingest),
     )
-    trainer = Trainer(
+    trained, dropped, few, fits = train_into(
+        context.out,
         Scene(gaussians, config.antialias, config.background or BLACK),
         views,
         config,
-        seed=(context.seed,),
-        formation=formation,
+        formation,
+        exposure=Exposure.identity([view.frame_id for view in views]),
+        checkpoint=context.checkpoints / "g0.safetensors",
+        reporter=context.reporter,
+        label="G0",
         device=context.device,
+        seed=(context.seed,),
     )
-    checkpoint = context.checkpoints / "g0.safetensors"
-    trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
-    learned = formation.exposure or Exposure.identity(list(weights))
-    moving = formation.moving
-    before = trained.scene.gaussians.num
-    trained, few, fits = without_dust(trained, views, learned, formation.frames, moving, context.device)
-    write_ply(context.out / "scene.ply", trained.scene)
-    write_table(context.out / "train.parquet", trained.rows, TRAIN)
-    write_exposure(context.out / "exposure.parquet", learned)
-    write_formation(context.out / "formation.parquet", formation, weights)
-    write_movement(context.out / "movement.parquet", moving)
-    save_state(context.out / "state.safetensors", trained.state)
-
     psnr = {view.frame_id: fit.psnr for view, fit in zip(few, fits, strict=True)}
     strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
     return StageResult(
-        summary={
-            "views": len(views),
-            "gaussians_start": gaussians.num,
-            "gaussians": trained.scene.gaussians.num,
-            "gaussians_dropped": before - trained.scene.gaussians.num,
-            "steps": config.length,
-            "sh_degree": gaussians.sh_degree,
-            "exposure": exposure is not None,
-            "exposure_spread": exposure_spread,
-            "colour_spread": colour_spread,
-            "moving_share": sum(float(cells.mean()) for cells in moving.values()) / len(views),
-            "psnr_strong": mean_psnr(psnr[frame_id] for frame_id in strong if frame_id in psnr),
-            "psnr_active": mean_psnr(psnr.values()),
-            "psnr_unseen": pooled_unseen(fits),
-        }
+        summary=G0Summary(
+            views=len(views),
+            gaussians_start=gaussians.num,
+            gaussians=trained.scene.gaussians.num,
+            gaussians_dropped=dropped,
+            steps=config.length,
+            sh_degree=gaussians.sh_degree,
+            exposure=exposure is not None,
+            exposure_spread=exposure_spread,
+            colour_spread=colour_spread,
+            moving_share=sum(float(cells.mean()) for cells in formation.moving.values()) / len(views),
+            psnr_strong=mean_psnr(psnr[frame_id] for frame_id in strong if frame_id in psnr),
+            psnr_active=mean_psnr(psnr.values()),
+            psnr_unseen=pooled_unseen(fits),
+        ).figures()
     )
 
 

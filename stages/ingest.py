@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field, field_validator
 
@@ -55,18 +54,6 @@ class IngestConfig(SfmConfig, CaptureConfig):
 
 FEW_FRAMES = 20
 """Number of frames below which a warning is given."""
-
-DRAFT_FRAMES, DRAFT_SIZE = 60, 640
-"""Maximum number of frames in a draft, and maximum long side of its images, px."""
-
-
-def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig:
-    """Return the settings, limited to `DRAFT_FRAMES` and `DRAFT_SIZE` if the run is a draft."""
-    if getattr(sections.get("g0"), "quality", None) != "draft":
-        return config
-    frames, size = min(config.max_frames, DRAFT_FRAMES), min(config.max_size, DRAFT_SIZE)
-    return config.model_copy(update={"max_frames": frames, "max_size": size})
-
 
 VERSION = 21
 CONFIG = IngestConfig
@@ -144,6 +131,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     from cleargs.capture.publish import publish
     from cleargs.capture.sfm import contradictions, reconstruct
     from cleargs.capture.sources import open_capture
+    from cleargs.capture.summary import IngestSummary
     from cleargs.media.image import read_rgb
 
     config, work, reporter = context.config, context.checkpoints, context.reporter
@@ -191,26 +179,26 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     write_motion(context.out / "motion.parquet", frames, motion)
     return StageResult(
         missing=contradictions(outcome, config, reporter),
-        summary={
-            "kind": capture.kind,
-            "input": capture.told,
-            "poses": {"given": "input", "adjusted": "refined", "sfm": "sfm"}[outcome.method],
-            "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
-            "pose_convention": outcome.convention if capture.posed else None,
-            "kept_out_matches_off_px": {name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
-            "kept_out": outcome.prediction and outcome.prediction.model_dump(),
-            "cameras": scene.cameras(),
-            **motion.summary(),
-            "frames": len(frames),
-            "frames_available": capture.n_available,
-            "registered": len(model.images),
-            "placed": dict(Counter(outcome.placed[frame.image] for frame in frames)),
-            "test": len(test),
-            "holdout_hash": holdout_hash(config.holdout, (frames[index].source.name for index in test)),
-            "points": len(model.point_ids),
-            "observations": sum(len(image.point_ids) for image in model.images.values()),
-            "mean_reprojection_error_px": round(float(model.error.mean()), 6),
-            "up": "found" if scene.stood else "tops of the pictures",
-            "similarity": scene.similarity.to_json(),
-        },
+        summary=IngestSummary(
+            kind=capture.kind,
+            input=capture.told,
+            poses=outcome.method,
+            given_poses_missed_px=outcome.missed_px and round(outcome.missed_px, 6),
+            pose_convention=outcome.convention if capture.posed else None,
+            kept_out_matches_off_px={name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
+            kept_out=outcome.prediction and outcome.prediction.model_dump(),
+            cameras=scene.cameras(),
+            frames=len(frames),
+            frames_available=capture.n_available,
+            registered=len(model.images),
+            placed=dict(Counter(outcome.placed[frame.image] for frame in frames)),
+            test=len(test),
+            holdout_hash=holdout_hash(config.holdout, (frames[index].source.name for index in test)),
+            points=len(model.point_ids),
+            observations=sum(len(image.point_ids) for image in model.images.values()),
+            mean_reprojection_error_px=round(float(model.error.mean()), 6),
+            up="found" if scene.stood else "tops of the pictures",
+            similarity=scene.similarity.to_json(),
+        ).figures()
+        | motion.summary(),
     )

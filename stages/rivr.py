@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from cleargs.base_model import FrozenModel
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.rivr.gates import GateConfig
+from cleargs.rivr.config import RepairConfig
 from cleargs.rivr.harm import HarmConfig
+from cleargs.scene.folder import LOG, TRAINED, SceneFolder
 from cleargs.splat.config import TrainConfig
 
-from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
+from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, DistilConfig
 from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
-    from cleargs.rivr.distillation import TrainedScene
-    from cleargs.rivr.rounds import Rules
+    from cleargs.rivr.rounds import RepairContext
     from cleargs.rivr.tables import Selection
     from cleargs.rivr.targets import Supervision
+    from cleargs.scene.viewer import SceneViewer
     from cleargs.splat.views import TrainingView
 
 
@@ -38,10 +38,15 @@ class RoundsConfig(DistilConfig):
     )
 
 
-class RivrConfig(FrozenModel):
+class RivrConfig(RepairConfig):
     """Render-Guided In-Video Restoration."""
 
-    rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="rounds in which every target frame is repaired")
+    rounds: int = Field(
+        2,
+        ge=0,
+        le=MAX_ROUNDS,
+        description="rounds in which every target frame is repaired; 0: no repairs, the scene is that of g0",
+    )
     targets: Literal["auto", "all"] = Field(
         "auto",
         description="frames to repair: all registered training frames; auto = those that image formation and "
@@ -70,31 +75,6 @@ class RivrConfig(FrozenModel):
         "along the trajectory, and the repairs of a group are distilled before the next one is rendered, as "
         "in the paper; unset = one group. The groups share distil.steps of the round",
     )
-    margin: float = Field(
-        1.0, ge=0.0, le=100.0, description="primary scores this close to the best go to the tie-break scorer"
-    )
-    keep_raw: bool = Field(
-        True,
-        description="a raw frame that needs no repair is trained on as filmed; false: every target frame "
-        "gets a pseudo observation, as in the paper",
-    )
-    fuse_sigma: float = Field(
-        2.0, gt=0.0, le=100.0, description="Gaussian that splits detail from base in the fusion, px"
-    )
-    use_observation: bool = Field(
-        True, description="false: the ablation whose expert restores the render instead of the raw frame"
-    )
-    undo_motion: bool = Field(
-        True,
-        description="with use_observation: undo the blur and the skew of the camera's motion in the raw "
-        "frame before the expert restores it; false: the expert restores the raw frame, as in the paper",
-    )
-    use_fused: bool = Field(
-        False,
-        description="a third candidate, as in the paper: the render with the detail of the restored frame. "
-        "With undo_motion the restored frame already has the render's detail; the fusion has it twice",
-    )
-    gate: GateConfig = Field(GateConfig(), description="limits beyond which a repair is refused")
     distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")
     harm: HarmConfig = Field(
         HarmConfig(), description="limits beyond which the distilled scene is rejected for G0"
@@ -115,7 +95,7 @@ class RivrConfig(FrozenModel):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 53
+VERSION = 54
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -123,7 +103,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "rva": ("frames.parquet",),
     "g0": TRAINED,
 }
-OUTPUTS = (*TRAINED, "train.parquet", "selection.parquet")
+OUTPUTS = (*TRAINED, LOG, "selection.parquet")
 LEFTOVERS = ("round_*/*.exr",)
 LIBRARIES = REPAIR_LIBRARIES
 
@@ -141,18 +121,21 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: RivrConfig) -> None:
-    """Load expert and scorers. Raises InputError if one is not installed, is damaged, or cannot be used."""
+    """Load candidates and models. Raises InputError if one is not installed, is damaged, or unusable."""
     from cleargs.models.expert import load_expert
     from cleargs.models.scorer import load_scorer
+    from cleargs.rivr.candidates import candidate
 
+    for name in config.candidates:
+        candidate(name)
     load_expert(config.expert)
     for name in (config.primary_scorer, config.tiebreak_scorer):
         load_scorer(name)
 
 
 def idle(sections: Mapping[str, Any]) -> bool:
-    """Return True for a draft, which makes no repairs."""
-    return bool(sections["g0"].quality == "draft")
+    """Return True if no repair is made."""
+    return bool(sections["rivr"].rounds == 0)
 
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
@@ -165,7 +148,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 
     config, g0 = context.config, context.settings["g0"]
     frames, megapixels = capture_size(context)
-    if idle(context.settings):
+    if config.rounds == 0:
         return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
     targets = frames if config.targets == "all" else max(2, round(AUTO_SHARE * frames))
     deblurs = config.use_observation and config.undo_motion
@@ -186,42 +169,38 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.distillation import TrainedScene, check_harm, publish
+    from cleargs.rivr.distillation import check_harm
     from cleargs.rivr.need import frames_to_repair, rows_of_others
-    from cleargs.rivr.rounds import Rules, forget_others
+    from cleargs.rivr.rounds import RepairContext, forget_others
+    from cleargs.rivr.summaries import RivrSummary
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
+    from cleargs.scene.viewer import SceneViewer
     from cleargs.splat.backend import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.control)
     measured = load_paths(context.inputs["ingest"])
-    g0 = TrainedScene(context.inputs["g0"], context.device, measured)
-    if context.settings["g0"].quality == "draft":
+    g0 = SceneViewer(context.inputs["g0"], context.device, measured)
+    if config.rounds == 0:
         return _unchanged(context, supervision, g0)
     chosen = frames_to_repair(config.targets, supervision, g0.formations)
     targets = [supervision.views[frame_id] for frame_id in chosen]
     forget_others(context.out, config.rounds, targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
-    rules = Rules(
-        expert=expert,
+    repairing = RepairContext(
+        config,
+        expert,
         primary=load_scorer(config.primary_scorer, networks_on),
         tiebreak=load_scorer(config.tiebreak_scorer, networks_on),
         cache=context.checkpoints / "restored",
         threads=threads,
-        use_observation=config.use_observation,
-        undo_motion=config.undo_motion,
-        use_fused=config.use_fused,
-        keep_raw=config.keep_raw,
-        fuse_sigma=config.fuse_sigma,
-        margin=config.margin,
-        gate=config.gate,
     )
     reporter.info(f"RIVR: {len(targets)} of {len(supervision.views)} frames are tried")
     others = rows_of_others(chosen, supervision, g0.formations)
-    rows, trainings, current = _repair_and_distil(context, supervision, targets, others, rules, g0)
+    rows, trainings, current = _repair_and_distil(context, supervision, targets, others, repairing, g0)
     write_selection(context.out / "selection.parquet", rows)
     made = len(rows) - len(others)
     if 2 * (refused := refused_repairs(rows)) > made:
@@ -231,19 +210,19 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         )
 
     repaired = any(row.accepted for row in rows)
-    checked = check_harm(g0, current, supervision, rules.primary, config.harm, threads, repaired=repaired)
+    checked = check_harm(g0, current, supervision, repairing.primary, config.harm, threads, repaired=repaired)
     if checked.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {checked.harm} on the control frames")
-    final, rejected = (current, None) if checked.harm is None else (g0, current)
-    publish(final, trainings, context.out, rejected)
+    final, rejected = (current, None) if checked.harm is None else (g0, current.files)
+    final.files.publish(trainings, context.out, rejected)
     return StageResult(
-        summary={
-            "expert": expert.name,
-            "rounds": [round_figures(number, rows) for number in sorted({row.round for row in rows})],
-            "held_back": asdict(checked),
-            "published": "distilled scene" if checked.harm is None else "G0",
-            "psnr_unseen": final.psnr_unseen(supervision.real),
-        }
+        summary=RivrSummary(
+            expert=expert.name,
+            rounds=[round_figures(number, rows) for number in sorted({row.round for row in rows})],
+            control=checked,
+            published="distilled scene" if checked.harm is None else "G0",
+            psnr_unseen=final.psnr_unseen(supervision.real),
+        ).figures()
     )
 
 
@@ -252,16 +231,16 @@ def _repair_and_distil(
     supervision: Supervision,
     targets: Sequence[TrainingView],
     others: Sequence[Selection],
-    rules: Rules,
-    g0: TrainedScene,
-) -> tuple[list[Selection], list[Path], TrainedScene]:
+    repairing: RepairContext,
+    g0: SceneViewer,
+) -> tuple[list[Selection], list[SceneFolder], SceneViewer]:
     """Run every round along the trajectory, group by group.
 
     A round that accepts no candidate is the last one. Its training also gets the steps of the remaining
     rounds. Returns the rows of all frames (first ``others``, the rows of frames that no round repairs), the
     folders of the trainings, and the last scene.
     """
-    from cleargs.rivr.distillation import drop_state
+    from cleargs.rivr.distillation import distil
     from cleargs.rivr.rounds import pseudo_view, run_round
     from cleargs.rivr.tables import kept_raw, repaired_share
     from cleargs.rivr.targets import trajectory_groups
@@ -271,7 +250,7 @@ def _repair_and_distil(
     length = config.distil.applied_to(g0_config, frames).length
     groups = trajectory_groups(targets, config.group, length)
     rows = list(others)
-    trainings: list[Path] = []
+    trainings: list[SceneFolder] = []
     current = g0
     for number in range(1, config.rounds + 1):
         steps = done = 0
@@ -279,7 +258,7 @@ def _repair_and_distil(
         for place, group in enumerate(groups):
             label = f"round {number}" + (f", group {place + 1} of {len(groups)}" if len(groups) > 1 else "")
             found = run_round(
-                number, group.targets, current, rules, context.out, reporter, label=f"{label}: candidates"
+                number, group.targets, current, repairing, context.out, reporter, label=f"{label}: candidates"
             )
             rows += found
             kept = kept_raw(rows)
@@ -299,7 +278,8 @@ def _repair_and_distil(
             # Nothing is trained without repairs and kept frames: the next group gets the steps.
             if not (repairs or kept) or not steps:
                 continue
-            current = current.trained(
+            current = distil(
+                current,
                 [*supervision.real, *repairs],
                 config.distillation(g0_config, number, done, steps, frames),
                 context.checkpoints / f"round_{number:02d}" / f"group_{place + 1:03d}",
@@ -313,20 +293,20 @@ def _repair_and_distil(
             )
             done, steps = done + steps, 0
             if trainings:
-                drop_state(trainings[-1])
-            trainings.append(current.folder)
+                trainings[-1].drop_state()
+            trainings.append(current.files)
         if not taken:
             break
     return rows, trainings, current
 
 
-def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: TrainedScene) -> StageResult:
-    """Publish G0's scene unchanged: a draft makes no repairs."""
-    from cleargs.rivr.distillation import publish
+def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: SceneViewer) -> StageResult:
+    """Publish G0's scene unchanged."""
+    from cleargs.rivr.summaries import RivrSummary
     from cleargs.rivr.tables import Selection, write_selection
 
-    context.reporter.info("RIVR: no repairs in a draft: the scene of G0 stays as it is")
-    rows = [Selection.not_tried(frame_id, "not tried: a draft") for frame_id in supervision.views]
+    context.reporter.info("RIVR: no repairs are made: the scene of G0 stays as it is")
+    rows = [Selection.not_tried(frame_id, "not tried: no repairs are made") for frame_id in supervision.views]
     write_selection(context.out / "selection.parquet", rows)
-    publish(g0, [], context.out, None)
-    return StageResult(summary={"rounds": [], "published": "G0", "draft": True})
+    g0.files.publish([], context.out, None)
+    return StageResult(summary=RivrSummary(rounds=[], published="G0").figures())

@@ -30,7 +30,7 @@ from report_run import FinishedRun
 
 from cleargs.cli.main import invoke
 from cleargs.manifest import linked_manifest
-from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.stages import Stages, installed
 
 Commands: TypeAlias = tuple[tuple[str, ...], ...]
 
@@ -126,7 +126,7 @@ class Planter:
     root: Path
     folder: Path
     """The run."""
-    dag: Dag
+    dag: Stages
     commands: Commands
     words: Mapping[str, Path]
     """Word of a command, or begin of one -> path in its place."""
@@ -221,7 +221,7 @@ class Planter:
         return True
 
 
-def give(command: Sequence[str], dag: Dag, words: Mapping[str, Path]) -> int:
+def give(command: Sequence[str], dag: Stages, words: Mapping[str, Path]) -> int:
     """Give a command with a path for each of the ``words``, and return its exit code."""
     arguments = []
     for argument in command:

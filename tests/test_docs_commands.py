@@ -23,7 +23,7 @@ from cleargs.cli.main import cli, invoke
 from cleargs.media.encode import write_video
 from cleargs.media.image import read_rgb, write_rgb
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 from cleargs.progress import SilentReporter
 from cleargs.synth.path import FPS
 from cleargs.synth.synthetic_capture import make_capture

@@ -15,6 +15,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cleargs.media",),
     ("cleargs.capture", "cleargs.models", "cleargs.splat"),
     ("cleargs.formation", "cleargs.rva"),
+    ("cleargs.scene",),
     ("cleargs.rivr", "cleargs.evaluate", "cleargs.synth"),
     ("cleargs.pipeline",),
     ("cleargs.handover",),

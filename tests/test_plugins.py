@@ -15,9 +15,11 @@ from cleargs.errors import ConfigError, InputError, StoreError
 from cleargs.models.expert import load_expert
 from cleargs.models.scorer import load_scorer
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import plugin_versions
+from cleargs.pipeline.stages import installed
 from cleargs.plugins import plugins
+from cleargs.progress import SilentReporter
+from cleargs.rivr.candidates import Materials, candidate
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.formation import Formation
@@ -147,6 +149,34 @@ def test_format(parts: Path, tmp_path: Path) -> None:
     assert ".csv" in caught.value.hint and ".ply" in caught.value.hint
 
 
+def test_candidate(parts: Path) -> None:
+    config = load_config(installed(), "default", ['rivr.candidates=["fused", "mean"]']).sections["rivr"]
+    assert config.candidates == ("fused", "mean")
+    assert plugin_versions(config) == {"cleargs-parts for candidates=mean": "1.0"}
+    render, restored = np.zeros((4, 4, 3), np.float32), np.ones((4, 4, 3), np.float32)
+    made = candidate("mean").make(Materials(render, restored, render, 2.0))
+    assert made.dtype == np.float32 and (made == 0.5).all()
+    with pytest.raises(ConfigError, match="candidates") as caught:
+        load_config(installed(), "default", ['rivr.candidates=["fuse"]'])
+    assert caught.value.hint == "did you mean fused?"
+
+
+def test_densifier(parts: Path, tmp_path: Path) -> None:
+    """The strategy removes the transparent half of the scene; the training continues with the other half."""
+    config = TrainConfig(steps=8, densify="prune", refine_every=0.5, lr_opacities=0.0, coarse_share=0.0)
+    assert plugin_versions(config) == {"cleargs-parts for densify=prune": "1.0"}
+    scene = toy()
+    scene.gaussians.logit_opacities[::2] = -9.0
+    camera = Camera(48, 32, 40.0, 40.0, 24.0, 16.0, np.eye(4))
+    image = np.full((32, 48, 3), 128, np.uint8)
+    view = TrainingView(0, camera, 1.0, "real", lambda: (image, None))
+    trained = Trainer(scene, [view], config, seed=(0,)).run(
+        checkpoint=tmp_path / "c", reporter=SilentReporter()
+    )
+    assert trained.scene.gaussians.num == scene.gaussians.num // 2
+    assert len(trained.rows) == 8
+
+
 def toy(count: int = 30) -> Scene:
     rng = np.random.default_rng(5)
     return Scene(
@@ -180,7 +210,7 @@ def test_formation(parts: Path) -> None:
 
     scene, vignette = toy(), Vignette(rate=0.5)
     model: Formation = vignette
-    config = TrainConfig(steps=60, densify=False, lr_means=0.0, lr_sh=0.0, lr_opacities=0.0, coarse_share=0.0)
+    config = TrainConfig(steps=60, densify="off", lr_means=0.0, lr_sh=0.0, lr_opacities=0.0, coarse_share=0.0)
     config = config.model_copy(update={"background": (0.0, 0.0, 0.0)})  # the blobs leave gaps
     trainer = Trainer(scene, toy_views(scene, dim=0.4), config, seed=(0,), formation=model)
     while trainer.done < config.steps:

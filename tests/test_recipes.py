@@ -17,7 +17,7 @@ from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError, InputError
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import Config, load_config
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 from cleargs.rva.evaluators import check_evaluator
 from cleargs.splat.config import FormationConfig
 from cleargs.stages.rva import RvaConfig
@@ -28,13 +28,13 @@ METHOD: dict[str, Any] = {
     "rva.coverage": True,
     "rva.active_share": 0.0,  # suppressed frames stay suppressed
     "rivr.targets": "all",
-    "rivr.harm.held_back": 0.0,  # every frame is a target, no veto
+    "rivr.harm.control": 0.0,  # every frame is a target, no veto
     "rivr.group": 8,  # along the trajectory
     "rivr.use_observation": True,
     "rivr.undo_motion": False,
     "g0.formation.enabled": False,
     "rivr.keep_raw": False,
-    "rivr.use_fused": True,
+    "rivr.candidates": ("fused",),
     "rivr.gate.max_share": 1.0,  # no gate
     "rivr.distil.pseudo_share": "even",
     "rivr.distil.pseudo_weight": 1.0,
@@ -250,6 +250,11 @@ def test_a_draft_limits_the_capture_and_trains_g0_to_its_end() -> None:
     assert (asked["ingest"].max_frames, asked["ingest"].max_size) == (200, 960)
     assert (used["ingest"].max_frames, used["ingest"].max_size) == (60, 640)
     assert asked["g0"].end < 1.0 and used["g0"].end == 1.0
+    assert (asked["rivr"].rounds, used["rivr"].rounds) == (2, 0)
+    assert (
+        load_config(installed(), "draft").effective
+        == load_config(installed(), overrides=["g0.quality=draft"]).effective
+    )
     smaller: Any = load_config(installed(), "smoke", ["g0.quality=draft"]).effective
     assert (smaller["ingest"].max_frames, smaller["ingest"].max_size) == (24, 480)
 

@@ -52,7 +52,7 @@ This page is made from the source: `python -m tools.api_page > docs/api.md`.
 RETURNED = (
     "cleargs.splat.trainer.Trained",
     "cleargs.splat.types.Render",
-    "cleargs.rivr.distillation.Deblurred",
+    "cleargs.scene.viewer.Deblurred",
     "cleargs.evaluate.eval_report.Evaluation",
     "cleargs.evaluate.config.EvalOptions",
     "cleargs.capture.tables.Frame",

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.settings import settings_of
+from cleargs.pipeline.stages import installed
 
 INTRODUCTION = """\
 # Settings

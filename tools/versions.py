@@ -24,7 +24,7 @@ from typing import Any
 
 import cleargs
 from cleargs.files import write_json
-from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.stages import Stages, installed
 
 LOCK_NAME = "versions.lock.json"
 
@@ -80,7 +80,7 @@ def installed_sources() -> Sources:
     return Sources({"cleargs": Path(cleargs.__path__[0]), "cleargs.stages": Path(stages.__path__[0])})
 
 
-def current_lock(dag: Dag, sources: Sources, package: str = "cleargs.stages") -> Lock:
+def current_lock(dag: Stages, sources: Sources, package: str = "cleargs.stages") -> Lock:
     """Return the lock for the current sources."""
     lock: Lock = {}
     for name in dag.names:

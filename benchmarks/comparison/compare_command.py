@@ -24,9 +24,9 @@ from cleargs.cli.common import (
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ Examples:
 @quiet_option
 @click.pass_obj
 def compare(
-    dag: Dag,
+    dag: Stages,
     sources: tuple[Path, ...],
     out: Path,
     variants: str,

@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.comparison.variants import Variant
 from cleargs.errors import ConfigError
 from cleargs.pipeline.config import Config, check_document, load_config, merge, parse_override, read_recipe
-from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.stages import Stages
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def split_steps(own: Steps, stage: str, total: int) -> Steps:
 
 
 def variant_config(
-    dag: Dag,
+    dag: Stages,
     variant: Variant,
     recipe: str,
     overrides: Sequence[str],

@@ -11,8 +11,8 @@ import click
 from cleargs.cli.common import DONE_IN_PART, output_option, quiet_option, work_options
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ Examples:
 @quiet_option
 @click.pass_obj
 def evidence(
-    dag: Dag,
+    dag: Stages,
     out: Path,
     quick: bool,
     captures: Path | None,

@@ -10,8 +10,8 @@ from cleargs.cli.common import DONE_IN_PART, output_option, quiet_option, work_o
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import STORE_FOLDER
 
 
@@ -65,7 +65,7 @@ Examples:
 @quiet_option
 @click.pass_obj
 def real(
-    dag: Dag,
+    dag: Stages,
     out: Path,
     captures: Path | None,
     seeds: int,

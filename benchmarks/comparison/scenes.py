@@ -26,9 +26,9 @@ from cleargs.files import write_bytes
 from cleargs.manifest import Manifest, linked_manifest
 from cleargs.parquet import read_errors
 from cleargs.pipeline.config import Config, load_config, read_toml
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE, RunSpec, read_run_file
 from cleargs.pipeline.runner import Runner
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.safe_io import read_bytes, read_json
@@ -74,7 +74,7 @@ class Sample:
 class SceneRecipe:
     """Settings that all runs of a comparison share."""
 
-    dag: Dag
+    dag: Stages
     workflow: str
     overrides: tuple[str, ...]
     device: Device
@@ -359,7 +359,7 @@ def cached_evaluation(
     return evaluation, folder
 
 
-def scene_of_run(run: Path, dag: Dag, reference: Path | None) -> FinishedScene:
+def scene_of_run(run: Path, dag: Stages, reference: Path | None) -> FinishedScene:
     """Return the last scene of a run, as a variant with the run's name; raise InputError without a scene."""
     spec = read_run_file(run, dag)
     for stage in ("consolidate", "rivr", "g0"):

@@ -13,8 +13,8 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError, StoreError
-from cleargs.formation.frames import camera_of
 from cleargs.media.colour import linear_from_srgb
+from cleargs.scene.views import camera_of
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply

@@ -65,7 +65,7 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("full", "ClearGS", "consolidate"),
     Variant("paper-open", "paper's method, open models", "consolidate", workflow="paper-open"),
     Variant(
-        "no-fused", "paper's method w/o F_t", "consolidate", ("rivr.use_fused=false",), workflow="paper-open"
+        "no-fused", "paper's method w/o F_t", "consolidate", ("rivr.candidates=[]",), workflow="paper-open"
     ),
 )
 """Variants from the simplest to the whole method, then those of the paper's recipe. Stages that have equal

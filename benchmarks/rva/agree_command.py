@@ -15,10 +15,10 @@ from cleargs.digest import tree_digest
 from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest
 from cleargs.pipeline.config import Config, check_document, merge, parse_override
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.session import DeviceChoice, resolve_device
+from cleargs.pipeline.stages import Stages
 from cleargs.progress import Reporter
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ Examples:
 @quiet_option
 @click.pass_obj
 def agree(
-    dag: Dag,
+    dag: Stages,
     run: Path,
     evaluators: tuple[str, ...],
     most: int,
@@ -119,7 +119,7 @@ def agree(
     return DONE_IN_PART if any(unscored.values()) else 0
 
 
-def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> Any:
+def _config(dag: Stages, config: Config, name: str, overrides: Sequence[str]) -> Any:
     """Return the run's settings of RVA with another evaluator, NAME or NAME:MODEL."""
     evaluator, _, model = name.partition(":")
     document = config.document()
@@ -131,7 +131,7 @@ def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> An
     return check_document(dag, merge(document, {"rva": change})).sections["rva"]
 
 
-def _own_cues(dag: Dag, run: Path, config: Any, frames: Sequence[Frame]) -> EvaluatorCues | None:
+def _own_cues(dag: Stages, run: Path, config: Any, frames: Sequence[Frame]) -> EvaluatorCues | None:
     """Return the cues in the run's table if this evaluator measured them on these images, else None."""
     import numpy as np
 

@@ -11,8 +11,8 @@ import click
 from cleargs.cli.common import json_option, print_json
 from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.stages import Stages
 
 if TYPE_CHECKING:
     from benchmarks.rva.truth import Check
@@ -41,7 +41,7 @@ Examples:
 )
 @json_option
 @click.pass_obj
-def check(dag: Dag, runs: tuple[Path, ...], as_json: bool) -> None:
+def check(dag: Stages, runs: tuple[Path, ...], as_json: bool) -> None:
     """Correlate the cues of each RUN with the known degradations of its synthetic capture.
 
     The table shows Spearman's rank correlation. Blur under 1 px and exposure errors under a quarter of a
@@ -61,7 +61,7 @@ def check(dag: Dag, runs: tuple[Path, ...], as_json: bool) -> None:
         click.echo("  ".join([run.ljust(width), *cells]))
 
 
-def _check(run: Path, dag: Dag) -> Check:
+def _check(run: Path, dag: Stages) -> Check:
     """Compare the run's cues with the truth; raise InputError if either is missing."""
     import numpy as np
 

@@ -14,7 +14,7 @@ from cleargs.api import evaluate_scene
 from cleargs.api import run as run_capture
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.splat.config import Quality
 

@@ -25,20 +25,22 @@ from rich.filesize import decimal
 
 from cleargs.batch.sheet import SceneJob, SheetError
 from cleargs.capture.sources import whole_capture
+from cleargs.capture.summary import IngestSummary
 from cleargs.errors import CleargsError, InputError, listed
 from cleargs.files import write_bytes
 from cleargs.own_files import refuse_links
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import Place
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import is_store, visible_names
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.render import TARGETS
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
+from cleargs.rivr.summaries import TrainingSummary
 from cleargs.safe_io import read_bytes
 from cleargs.subprocesses import module_command
 from cleargs.types import Device
@@ -89,7 +91,7 @@ class Result:
 class Batch:
     """The scenes of a sheet, and the options with which they run."""
 
-    dag: Dag
+    dag: Stages
     folder: Path
     """Absolute path of the batch."""
     scenes: Sequence[SceneJob]
@@ -246,14 +248,14 @@ class Batch:
     def result(self, scene: SceneJob) -> Result:
         """Return the present state and figures of ``scene``."""
         made = linked_manifests(self.run_folder(scene), self.dag.names)
-        ingest = made["ingest"].summary if "ingest" in made else {}
-        psnr = [manifest.summary.get("psnr_unseen") for manifest in made.values()]
+        ingest = IngestSummary.of(made.get("ingest"))
+        psnr = [TrainingSummary.of(manifest).psnr_unseen for manifest in made.values()]
         state, cause = self._state(scene)
         return Result(
             scene=scene.name,
             state=state,
-            frames=ingest.get("frames"),
-            frames_placed=ingest.get("registered"),
+            frames=ingest.frames,
+            frames_placed=ingest.registered,
             psnr_unseen=next((value for value in reversed(psnr) if value is not None), None),
             minutes=round(sum(manifest.seconds for manifest in made.values()) / 60, 2),
             memory_gb=max((manifest.peak_memory_gb or 0.0 for manifest in made.values()), default=0.0),

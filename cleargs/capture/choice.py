@@ -29,9 +29,9 @@ def select_sharp_frames(
 ) -> Capture:
     """Return ``capture`` with each frame of a video replaced by the sharpest of its stretch of time.
 
-    The stretch of a frame of ``capture`` is all frames of the video that are nearer in time to it than to the
-    other ones. Ties go to the earlier frame. Each video is decoded once. With ``by_motion``, the stretches
-    of a video whose pace is uneven have the same motion, not the same duration.
+    A frame's stretch is the frames of the video that are closest in time to it. Ties go to the earlier frame.
+    Each video is decoded once. With ``by_motion``, the stretches of a video whose pace is uneven have the
+    same motion, not the same duration.
     """
     if capture.kind != "video":
         return capture

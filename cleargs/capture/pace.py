@@ -19,7 +19,8 @@ _UNEVEN = {0.5: 0.3, 0.1: 0.05}
 Handheld walks (kitchen, office, terrace) have at most 0.24 and 0.04."""
 
 _SHAKE = 1.5
-"""Largest step that counts, as a factor of the median step of frames that move. A shake is not a new view."""
+"""Largest step that counts, as a factor of the median step of frames that move.
+A shake does not make a new view."""
 
 
 class Pace:

@@ -27,8 +27,8 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device
+from cleargs.pipeline.stages import Stages
 from cleargs.types import Device
 
 
@@ -60,7 +60,7 @@ To run scenes in parallel on a cluster, see docs/cluster.md.
 @quiet_option
 @click.pass_obj
 def batch(
-    dag: Dag,
+    dag: Stages,
     sheet: Path,
     folder: Path | None,
     until: str | None,

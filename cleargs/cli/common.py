@@ -16,10 +16,10 @@ from cleargs.cli.progress_bars import LOG, VERBOSE, LineFile, check_log
 from cleargs.errors import InputError, StoreError
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import recipe_names
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.session import usable_cores
 from cleargs.pipeline.settings import settings_of
+from cleargs.pipeline.stages import installed
 from cleargs.progress import Say
 from cleargs.splat.config import Quality
 

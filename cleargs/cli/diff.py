@@ -11,8 +11,8 @@ import click
 from cleargs.cli.common import FOLDER, json_option, print_json
 from cleargs.cli.show import LABELS
 from cleargs.errors import InputError
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RunSpec, read_run_file
+from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import linked_manifests
 
 FIGURES = ("frames", "registered", "gaussians", "psnr_unseen", "repairs")
@@ -29,7 +29,7 @@ Example:
 @click.argument("second", metavar="RUN", type=FOLDER)
 @json_option
 @click.pass_obj
-def diff(dag: Dag, first: Path, second: Path, as_json: bool) -> None:
+def diff(dag: Stages, first: Path, second: Path, as_json: bool) -> None:
     """List the settings in which two runs differ, and their figures side by side."""
     runs = [read_run_file(run, dag) for run in (first, second)]
     settings = _paired(*(dict(_settings(run)) for run in runs))
@@ -68,7 +68,7 @@ def _settings(run: RunSpec) -> Iterator[tuple[str, Any]]:
     yield from ((setting.name, value) for setting, value in run.config.settings())
 
 
-def _figures(run: RunSpec, dag: Dag) -> Iterator[tuple[str, Any]]:
+def _figures(run: RunSpec, dag: Stages) -> Iterator[tuple[str, Any]]:
     """Yield label and value of the figures of a run, from its stages and its evaluations."""
     from cleargs.evaluate.eval_report import read_report
 

@@ -22,9 +22,9 @@ from cleargs.digest import file_digest
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.manifest import has_results
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RUN_FILE, check_links
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import visible_names
 from cleargs.run_results import check_results, scene_path, scene_stage
 
@@ -131,7 +131,7 @@ stages and options stay there as long as their scenes do.
 @quiet_option
 @click.pass_obj
 def eval(
-    dag: Dag,
+    dag: Stages,
     target: Path | None,
     directory: Path | None,
     renders: Path | None,
@@ -237,7 +237,7 @@ def _seen_before(report: Report) -> str:
     return f"note: {count} views are of frames that the scene was trained on"
 
 
-def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequence[str]) -> dict[str, Path]:
+def _scenes(dag: Stages, target: Path | None, renders: Path | None, stages: Sequence[str]) -> dict[str, Path]:
     """Return name -> file of each scene to render; empty if finished images are evaluated."""
     if renders is not None:
         if stages or (target is not None and not target.is_dir()):

@@ -19,7 +19,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
-from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.stages import Stages, installed
 from cleargs.render import TARGETS
 from cleargs.run_results import scene_stage
 
@@ -152,7 +152,7 @@ Programs of --for:
 @quiet_option
 @click.pass_obj
 def export(
-    dag: Dag,
+    dag: Stages,
     /,
     run: Path,
     chosen: str | None,
@@ -205,10 +205,10 @@ def _export_capture(run: Path, folder: Path, repeat: int, deblurred: bool, as_js
     prepared = open_prepared(found["ingest"])
     sharper = None
     if deblurred:
-        from cleargs.formation.frames import view_of
-        from cleargs.rivr.distillation import TrainedScene
+        from cleargs.scene.viewer import SceneViewer
+        from cleargs.scene.views import view_of
 
-        trained = TrainedScene(run / scene_stage(installed(), run, None))
+        trained = SceneViewer(run / scene_stage(installed(), run, None))
         views = {frame.frame_id: view_of(frame, prepared.folder, 1.0) for frame in prepared.frames}
         sharper = lambda number: trained.deblur(views[number])  # noqa: E731
     made = prepared.to_nerfstudio(folder, weights, repeat=repeat, sharper=sharper)

@@ -75,7 +75,7 @@ def _missed(row: Mapping[str, Any], min_R: float, max_B: float) -> str:
 
 def _repair(row: Mapping[str, Any] | None) -> str:
     """Return RIVR's choice in the last round of a frame: a layer, "as filmed", "refused" or "none"."""
-    from cleargs.rivr.gates import REFUSED
+    from cleargs.rivr.candidates import REFUSED
 
     if row is None:
         return "none"

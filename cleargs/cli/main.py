@@ -19,7 +19,7 @@ import cleargs
 from cleargs.cli.commands import ALIASES, COMMANDS, SECTIONS, as_called
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import no_space
-from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.stages import Stages, installed
 from cleargs.safe_io import printable, require_utf8
 
 INTERRUPTED = 130
@@ -100,7 +100,9 @@ def cli(debug: bool) -> None:
     """
 
 
-def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program: click.Group = cli) -> None:
+def main(
+    arguments: Sequence[str] | None = None, dag: Stages | None = None, program: click.Group = cli
+) -> None:
     """Run the command line of ``program`` and exit. ``dag`` replaces the installed stages in tests."""
     from cleargs.cli.terminal import handle_signals, protect_streams
 
@@ -118,7 +120,7 @@ def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program
     sys.exit(code)
 
 
-def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = cli) -> int:
+def invoke(arguments: list[str], dag: Stages | None = None, program: click.Group = cli) -> int:
     """Run one command and return its exit code.
 
     An error is printed on stderr: a line with the cause, and one with a hint. ``--debug``, anywhere among the

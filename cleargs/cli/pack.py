@@ -16,9 +16,9 @@ from cleargs.files import atomic_path
 from cleargs.named_views import VIEWS
 from cleargs.own_files import regular_files
 from cleargs.packed import PACK, Pack, require_images
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import EVAL, RUN_FILE, SCENE, read_run_file
+from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import ENTRY, FOLDER, linked_manifests
 from cleargs.report.single_file import for_others
 from cleargs.run_results import scene_stage
@@ -43,7 +43,7 @@ Examples:
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @json_option
 @click.pass_obj
-def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -> None:
+def pack(dag: Stages, run: Path, output: Path | None, force: bool, as_json: bool) -> None:
     """Pack the files of RUN that its report and an export need into a ZIP file.
 
     These are the report, the last scene, the poses and the tables. The images, the earlier scenes and the
@@ -82,7 +82,7 @@ def pack(dag: Dag, run: Path, output: Path | None, force: bool, as_json: bool) -
     )
 
 
-def _files(run: Path, dag: Dag) -> Iterator[Path]:
+def _files(run: Path, dag: Stages) -> Iterator[Path]:
     yield from (run / name for name in (RUN_FILE, ENTRY, VIEWS) if (run / name).is_file())
     for folder in (run / FOLDER, run / EVAL):
         yield from regular_files(folder)

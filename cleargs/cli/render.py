@@ -19,8 +19,8 @@ from cleargs.cli.common import (
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device
+from cleargs.pipeline.stages import Stages
 from cleargs.report.formatting import count as count_of
 from cleargs.run_results import scene_stage
 
@@ -97,7 +97,7 @@ renders a picture for each pose.
 @quiet_option
 @click.pass_obj
 def render(
-    dag: Dag,
+    dag: Stages,
     /,
     run: Path,
     chosen: str | None,

@@ -26,12 +26,12 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
 from cleargs.named_views import keep_views
 from cleargs.packed import read_pack, require_images
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import ENTRY, is_current, is_own_page, linked_manifests, page_of
 
 
@@ -65,7 +65,7 @@ Examples:
 @quiet_option
 @click.pass_obj
 def report(
-    dag: Dag,
+    dag: Stages,
     run: Path,
     single_file: bool,
     output: Path | None,
@@ -134,7 +134,7 @@ def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path
         return None
 
 
-def outdated_report_note(run: Path, dag: Dag) -> str:
+def outdated_report_note(run: Path, dag: Stages) -> str:
     """Return a note if the report of ``run`` shows earlier results, or "" otherwise."""
     page = page_of(run)
     if not page.is_file() or is_current(run, linked_manifests(run, dag.names)):
@@ -167,7 +167,7 @@ It updates itself. After the run, it shows the report.
 @open_option("Open the page in the browser.")
 @store_option
 @click.pass_obj
-def watch(dag: Dag, run: Path, host: str, port: int, opens: bool, store: Path | None) -> None:
+def watch(dag: Stages, run: Path, host: str, port: int, opens: bool, store: Path | None) -> None:
     """Serve a page with the progress of RUN, and later its report, until Ctrl-C."""
     from cleargs.report.serve import Server
 

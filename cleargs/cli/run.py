@@ -43,13 +43,13 @@ from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.errors import StageError
 from cleargs.packed import WORKS, read_pack
 from cleargs.pipeline.config import Config
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import stage_at_work
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line, cost_text
 from cleargs.pipeline.run_file import RUN_FILE, RUN_LOG, SCENE, read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.pipeline.settings import flattened
+from cleargs.pipeline.stages import Stages
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import ENTRY, linked_manifests
@@ -150,7 +150,7 @@ def run(
     reused, and an interrupted run resumes. An existing run keeps its settings (RUN/run.toml) until an option,
     --recipe or --reset changes them.
     """
-    dag: Dag = context.obj
+    dag: Stages = context.obj
     dag.until(until)
     if folder is None and (source / RUN_FILE).is_file():  # the user gives the run in place of its capture
         folder, source = source, read_run_file(source, dag).source
@@ -279,7 +279,7 @@ States:
 @store_option
 @json_option
 @click.pass_obj
-def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
+def status(dag: Stages, run: Path, store: Path | None, as_json: bool) -> None:
     """Show for each stage of RUN if it is done, outdated or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
     if packed := read_pack(settings.folder):
@@ -307,7 +307,7 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
     print_plans(plans, as_json, settings.stages(dag))
 
 
-def _with_outdated(plans: list[StagePlan], run: Path, dag: Dag) -> list[StagePlan]:
+def _with_outdated(plans: list[StagePlan], run: Path, dag: Stages) -> list[StagePlan]:
     """Return the plans; stages that have results of other settings or inputs are outdated, not missing."""
     shown = linked_manifests(run, dag.names)
     return [
@@ -388,7 +388,7 @@ def _quality(summaries: Summaries) -> str:
         f"PSNR {figures['psnr_unseen']:.1f} dB{compared} on pixels that no training saw; "
         "views off the camera path are worse"
     )
-    harm = figures.get("held_back", {}).get("harm")
+    harm = figures.get("control", {}).get("harm")
     return f"{text}. Rejected: {harm}" if harm else text
 
 

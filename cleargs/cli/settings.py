@@ -9,8 +9,8 @@ from dataclasses import asdict
 import click
 
 from cleargs.cli.common import complete_stage, json_option, print_json
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import settings_of
+from cleargs.pipeline.stages import Stages
 
 
 @click.command(
@@ -24,7 +24,7 @@ Examples:
 @click.argument("stage", required=False, shell_complete=complete_stage)
 @json_option
 @click.pass_obj
-def settings(dag: Dag, stage: str | None, as_json: bool) -> None:
+def settings(dag: Stages, stage: str | None, as_json: bool) -> None:
     """List all settings, or those of one STAGE: name = default, range, meaning."""
     names = dag.names if stage is None else (dag.check(stage),)
     found = {name: settings_of(name, dag.load(name).CONFIG) for name in names}

@@ -28,10 +28,10 @@ from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.packed import WORKS, read_pack
 from cleargs.parquet import meanings, read_any_table, read_table
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import RunSpec, read_run_file
+from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import linked_manifests
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ LABELS: Mapping[str, str] = {
     "repairs_refused": "repairs refused by the gate",
     "tie_breaks": "choices by the tie-break scorer",
     "latest_rounds": "repairs by round",
-    "held_back": "control frames",
+    "control": "control frames",
 }
 """Figure of a manifest -> its label, if its name is not clear."""
 
@@ -98,7 +98,7 @@ Examples:
 @json_option
 @click.pass_obj
 def show(
-    dag: Dag,
+    dag: Stages,
     run: Path,
     stage: str | None,
     columns: bool,
@@ -158,7 +158,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
             click.echo(f"preview: {preview.path}")
 
 
-def _show_extent(dag: Dag, run: Path, as_json: bool) -> None:
+def _show_extent(dag: Stages, run: Path, as_json: bool) -> None:
     """Print the scene's box, in the coordinates of the exports that turn nothing."""
     from cleargs.render.pruning import extent_text
     from cleargs.run_results import scene_path, scene_stage
@@ -257,9 +257,9 @@ def _show_frame(
 
     Raises InputError if there is no such frame, StoreError if the picture cannot be written.
     """
-    from cleargs.formation.frames import camera_of
     from cleargs.report.frames import MEANINGS, load_rows, worst_cue
     from cleargs.rivr.tables import REPAIRS
+    from cleargs.scene.views import camera_of
 
     if "ingest" not in done:
         raise InputError(f"{run} has no frames yet", hint=f"see cleargs status {run}")
@@ -295,20 +295,20 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
     They are the raw frame, the layers of its latest round or image formation, and the last scene at its pose.
     """
-    from cleargs.formation.frames import camera_of
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
     from cleargs.report.frames import last_scene, scene_with_models
     from cleargs.report.pictures import LAYERS, formed_layers, layers_of
-    from cleargs.splat.ply import read_ply
+    from cleargs.scene.folder import SceneFolder
+    from cleargs.scene.views import camera_of
     from cleargs.splat.render import Viewer
 
     images, scene = layers_of(row, run), last_scene(stages)
     images |= formed_layers(row, run, scene_with_models([row], run, stages))
     if scene is not None and row.frame.registered:
-        images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), row.affine)
-    shown = [name for name in LAYERS if name in images]
-    labels = {name: LAYERS[name] + (" (chosen)" if name == row.chosen else "") for name in shown}
+        images["final"] = Viewer(SceneFolder(run / scene).scene()).view(camera_of(row.frame), row.affine)
+    shown = [name for name in dict.fromkeys((*LAYERS, *images)) if name in images]
+    labels = {name: LAYERS.get(name, name) + (" (chosen)" if name == row.chosen else "") for name in shown}
     tiles = [Tile(images[name], labels[name], marked=name == row.chosen) for name in shown]
     lines = [tiles[start : start + LAYERS_ACROSS] for start in range(0, len(tiles), LAYERS_ACROSS)]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -318,7 +318,8 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
 def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield label and text of each line about a frame; ``settings`` of RVA. ``--json`` prints more facts."""
-    from cleargs.report.frames import CHOICES, EFFECTS, scores_of
+    from cleargs.report.frames import EFFECTS, scores_of
+    from cleargs.rivr.candidates import phrase_of
 
     frame, rated = row.frame, facts["rva"]
     if row.weight_text:
@@ -353,11 +354,11 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any])
         yield "weight", f"{before:.2f} before image formation, {after:.2f} after it"
     for choice in row.rounds:
         refused = ", refused" if not choice.accepted and choice.chosen != "observed" else ""
-        yield f"round {choice.round}", f"{CHOICES[choice.chosen]}{refused} ({choice.reason})"
+        yield f"round {choice.round}", f"{phrase_of(choice.chosen)}{refused} ({choice.reason})"
         for metric, scores in scores_of(choice):
             yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
     if repair := facts["distilled"]:
-        yield "final scene", f"trained on {CHOICES[repair['chosen']]} of round {repair['round']}"
+        yield "final scene", f"trained on {phrase_of(repair['chosen'])} of round {repair['round']}"
 
 
 def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:

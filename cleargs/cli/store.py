@@ -16,9 +16,9 @@ from cleargs.files import remove
 from cleargs.manifest import MANIFEST, Manifest, damages, has_results, read_manifest
 from cleargs.own_files import leftovers, refuse_links, size_of
 from cleargs.packed import read_pack
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import SCENE, RunSpec, read_run_file
 from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import ROOTS, Garbage, Store
 from cleargs.report.formatting import count
 
@@ -41,7 +41,7 @@ Example:
 @store_option
 @json_option
 @click.pass_obj
-def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
+def verify(dag: Stages, run: Path, store: Path | None, as_json: bool) -> int:
     """Check every file of RUN, and every input of it, against the digests in its manifests.
 
     Other commands do not read a file again if its size and time stamps are unchanged. The next `cleargs run`
@@ -94,7 +94,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
     return 1 if faults else 0
 
 
-def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) -> Iterator[StoreFault]:
+def _changed_inputs(dag: Stages, run: RunSpec, store: Store, manifest: Manifest) -> Iterator[StoreFault]:
     """Yield the inputs of a stage outside the store that changed since its manifest was written."""
     stage = manifest.stage
     for role, place in dag.load(stage).externals(run.config.effective[stage], run.source).items():
@@ -136,7 +136,13 @@ Examples:
 @json_option
 @click.pass_obj
 def gc(
-    dag: Dag, run: Path | None, store: Path | None, checkpoints: bool, dry_run: bool, yes: bool, as_json: bool
+    dag: Stages,
+    run: Path | None,
+    store: Path | None,
+    checkpoints: bool,
+    dry_run: bool,
+    yes: bool,
+    as_json: bool,
 ) -> None:
     """Remove the results that no run links to. The store is that of RUN, or --store.
 

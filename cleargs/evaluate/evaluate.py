@@ -25,7 +25,6 @@ from cleargs.evaluate.refinement import refine_pose
 from cleargs.files import disk_errors
 from cleargs.formation.frame import filmed_as
 from cleargs.formation.observed import FormedView
-from cleargs.formation.table import read_formation
 from cleargs.manifest import versions
 from cleargs.media.exr import read_depth
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
@@ -33,6 +32,7 @@ from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
 from cleargs.plugins import installed_version
 from cleargs.progress import Reporter
+from cleargs.scene.folder import SceneFolder
 from cleargs.splat.backend import decibels, rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.formats import read_scene
@@ -136,9 +136,8 @@ def evaluate_images(
 
 def exposure_of(folder: Path) -> float:
     """Return the median exposure time, s, that a training found with measured motions; 0 if it is unknown."""
-    table = folder / "formation.parquet"
-    frames = read_formation(table)[0] if table.is_file() else {}
-    times = [frame.motion.exposure_s for frame in frames.values() if frame.motion.exposure_s > 0.0]
+    rows = SceneFolder(folder).formation_rows().values()
+    times = [row["exposure_s"] for row in rows if row.get("exposure_s")]
     return median(times) if times else 0.0
 
 

@@ -19,14 +19,13 @@ from cleargs.capture.cutouts import are_cut_outs, over_white
 from cleargs.capture.folders import chosen, name_below_images, natural_key
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.prepare import is_as_stored, read_image, read_stencil
+from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.refinement import rotation_between
-from cleargs.formation.exposure import read_exposure
-from cleargs.formation.frames import has_alpha, view_of
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
@@ -34,6 +33,8 @@ from cleargs.media.image import read_transparency
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.packed import require_images
 from cleargs.progress import Reporter
+from cleargs.scene.folder import SceneFolder
+from cleargs.scene.views import has_alpha, view_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64, ImageU8, MaskBool
@@ -140,7 +141,8 @@ def reference_of(
                 reporter.warn(f"{missing} of {len(listed)} references match no frame: left out")
             alignment = Alignment(world="scene", matched=len(views))
         else:
-            if manifest.summary.get("poses") in ("sfm", "refined"):
+            ingested = IngestSummary.of(manifest)
+            if ingested.poses in ("sfm", "adjusted"):
                 observed = directory.parent / "observed"  # synthetic captures have it
                 if align is None and (observed / "transforms.json").is_file():
                     align = observed
@@ -150,7 +152,7 @@ def reference_of(
                 similarity, alignment = align_cameras(theirs, ours)
                 _report_fit(alignment, align or directory, reporter)
             else:
-                similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
+                similarity = Similarity.from_json(ingested.similarity, ingest)
                 theirs = [similarity.pose(view.pose) for view in listed.values()]
                 _require_one_unit(theirs, [*own.values()], _points(ingest))
             views = [
@@ -322,7 +324,7 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
     if made.parts.inputs.get("ingest", {}).get("images") != tree_digest(ingest.under("images")):
         return None
     try:
-        trained = {int(number) for number in read_exposure(run / stage / "exposure.parquet").frame_ids}
+        trained = {int(number) for number in SceneFolder(run / stage).exposure().frame_ids}
     except StoreError:
         return None
     own = {stem_of(frame.name): frame for frame in load_frames(run / "ingest") if frame.frame_id in trained}

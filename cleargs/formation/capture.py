@@ -1,15 +1,17 @@
 """The formation of every frame of a capture, estimated while a scene is trained on the frames.
 
-A *look* is a new estimate of a frame's formation. The first look *searches* the frame: it fits all models
-from scratch. Further looks follow after every `FormationConfig.every` steps on the frame. They refine its
-motion with the current scene. The frame is searched again only if a test of a few milliseconds (`pretest`)
-finds blur that the model does not explain; a sharper scene reveals more of it. In a draft, or if earlier
-frames show that the capture is sharp, this condition also holds for the first look. At the fourth look after
-the first one, the eighth, the sixteenth and so on, a path of a higher order is tried.
+A *look* is a new estimate of a frame's formation, after every `FormationConfig.every` steps on the frame.
+Each look refines the motion with the current scene. All models are searched from scratch for a `look.Reason`:
 
-Later trainings continue with the formations and the numbers of looks of the first one. They keep the
-formation of a frame that had `SETTLED` looks. If the shutter rolls, they keep none. The test cannot detect a
-skew, so every frame is then searched at the first look of a training, and whenever a higher order is tried.
+| look | path of a higher order | search |
+|---|---|---|
+| first | tried | yes, but not if ``first_search`` is off or other frames show a sharp capture |
+| 4th, 8th, 16th, ... after it | tried | if the path is curved or the shutter rolls |
+| any | - | if `pretest` (a few milliseconds) finds blur that the model does not explain |
+
+`pretest` cannot see a skew: while a rolling shutter is possible, frames are searched for it. Later trainings
+continue with formations and numbers of looks. They keep the formation of a frame that had `SETTLED` looks,
+unless the shutter rolls.
 """
 
 from __future__ import annotations
@@ -92,11 +94,10 @@ class CaptureFormation:
         known: Mapping[int, FrameFormation] | None = None,  # from an earlier training, by frame_id
         moving: Mapping[int, MaskBool] | None = None,  # cells that move, from an earlier training
         tolerance: float = 0.0,  # difference of mean sRGB colours above which a cell can move; 0: no looks
-        draft: bool = False,  # search a frame only if the test finds blur, also at the first look
         measured: Mapping[int, MeasuredPath] | None = None,  # motions of ingest, by frame_id
     ) -> None:
         weighted = [view for view in views if view.weight > 0.0]
-        self._config, self._draft = config, draft
+        self._config = config
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
         filmed = sorted((v for v in weighted if v.kind == "real"), key=lambda view: view.frame_id)
         real = [view.frame_id for view in filmed]
@@ -219,7 +220,7 @@ class CaptureFormation:
             doubted=self._weights[frame_id] < DOUBTED,
             shutter="rolls" if self._rolls(frame_id) else tested,
             curve=_searched_again(frame.draws // self._config.every),
-            sparing=self._draft or self._sharp(),
+            sparing=not self._config.first_search or self._sharp(),
             exposure_s=self._exposure(frame_id),
             measured=self._measured.get(frame_id),
         )

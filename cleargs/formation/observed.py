@@ -1,11 +1,9 @@
-"""The observed image of a frame (its render after image formation), its gradient, and its PSNR."""
+"""The observed image of a frame (its render after image formation) and its gradient."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,16 +12,14 @@ from torch import Tensor
 from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, margin_for
 from cleargs.formation.motion import widened
-from cleargs.formation.movement import counted
 from cleargs.formation.warp import Warp, displacement_fields, linear_curve, srgb_curve
-from cleargs.splat.backend import backend_for, psnr, rasteriser_for
+from cleargs.splat.backend import backend_for, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
-from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
-from cleargs.types import MaskBool
+from cleargs.splat.views import TrainingView
 
 
 @dataclass(eq=False)
@@ -111,53 +107,3 @@ def render_observed(
     formed = FormedView(view.camera, view.weight, affine=affine, formation=moved)
     render = engine.view(scene, formed.camera, depth=formed.needs_depth)
     return formed.forward(render).clamp(0.0, 1.0)
-
-
-MAX_EVALUATED = 32
-"""Maximum number of frames, evenly spread, on which a stage compares its scene with the photographs."""
-
-
-class Fit(NamedTuple):
-    """PSNR of a scene on one view, dB, over the pixels that count."""
-
-    psnr: float
-    unseen: float | None
-    """PSNR over the `unseen_pixels` that count, dB; None if there are none."""
-
-
-def pooled_unseen(fits: Iterable[Fit]) -> float | None:
-    """Return the PSNR, dB, over the pixels of all views that no training saw; None if there are none.
-
-    Errors are averaged, not PSNRs: views with little texture in these pixels would dominate a mean of PSNRs.
-    """
-    errors = [10.0 ** (-0.1 * fit.unseen) for fit in fits if fit.unseen is not None]
-    error = math.fsum(errors) / len(errors) if errors else 0.0
-    return -10.0 * math.log10(error) if error > 0.0 else None
-
-
-def evaluate_views(
-    scene: Scene,
-    views: Sequence[TrainingView],
-    exposure: Exposure | None = None,
-    formations: Mapping[int, FrameFormation] | None = None,
-    *,
-    moving: Mapping[int, MaskBool] | None = None,
-    engine: Rasteriser | None = None,
-) -> list[Fit]:
-    """Compare the observed image of the scene with every view, in their order, at full size.
-
-    Pixels of the cells ``moving``, by frame_id, do not count (see `cleargs.formation.movement`).
-    """
-    engine = engine or rasteriser_for(str(scene.gaussians.device))
-    images = ImageCache(0, scene.gaussians.device)
-    formations = formations or {}
-    fits = []
-    for view in views:
-        target, mask = images.get(view)
-        mask = counted(mask, (moving or {}).get(view.frame_id), target)
-        image = render_observed(scene, view, exposure, formations.get(view.frame_id), engine=engine)
-        unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
-        unseen = unseen if mask is None else unseen & mask
-        psnr_unseen = psnr(image, target, unseen) if bool(unseen.any()) else None
-        fits.append(Fit(psnr(image, target, mask), psnr_unseen))
-    return fits

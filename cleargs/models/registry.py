@@ -156,9 +156,9 @@ def registered(name: str, role: Role) -> RegistryEntry | None:
 def model_file(spec: str, role: Role) -> Path | None:
     """Return the absolute path of the weights of an expert or scorer, whose content is not checked.
 
-    ``spec`` is a model of the registry, the path of an ONNX file (it need not exist), or a plugin. For a
-    plugin the result is None: keys of the store contain its package's version. InputError is raised if the
-    name is unknown, or the model is not installed.
+    ``spec`` is a model of the registry, the path of an ONNX file (it need not exist), or a plugin: None
+    for a plugin (the key holds its package version instead). InputError is raised if the name is unknown, or
+    the model is not installed.
     """
     model = registered(spec, role)
     if model is not None and model.shipped is not None:

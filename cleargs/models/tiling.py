@@ -90,8 +90,8 @@ def map_tiled(
 ) -> ImageF32:
     """Apply a function to overlapping tiles of an image [H, W, 3], and blend the results to one.
 
-    ``function`` maps tiles [h, w, 3] of one size, which is ``fixed`` where it requires that, to tiles of that
-    size, in their order. The image is padded by reflection at the right and bottom if necessary.
+    ``function`` maps equal tiles [h, w, 3] to equal tiles, in their order. ``fixed`` is the tile size if the
+    network needs one. The image is padded by reflection at the right and bottom if necessary.
     """
     height, width = image.shape[:2]
     rows, columns = plan_axis(height, fixed[0]), plan_axis(width, fixed[1])

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from importlib.resources import files
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pydantic import BaseModel, ValidationError
 
 from cleargs.errors import ConfigError, did_you_mean
-from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.settings import Setting, flattened, settings_of, suggestion
+from cleargs.pipeline.settings import Setting, fields_of, flattened, former_names, settings_of, suggestion
+from cleargs.pipeline.stages import Stages
 from cleargs.safe_io import FAULTS, faults_as, read_text
 
 RECIPES = "cleargs.workflows"
@@ -37,7 +37,7 @@ class Config:
     sections: Mapping[str, BaseModel]
     """Stage -> its settings, with the defaults filled in."""
     effective: Mapping[str, BaseModel]
-    """Stage -> its settings as changed by those of other stages. Runs use these, and keys hold them."""
+    """Stage -> its settings, under the recipe of the quality. Runs use these, and keys hold them."""
 
     def document(self) -> Document:
         """Return the full configuration for TOML, which has no null: settings that are None are left out."""
@@ -54,7 +54,7 @@ class Config:
 
 
 def load_config(
-    dag: Dag, recipe: str | Document = "default", overrides: Sequence[str] = (), seed: int | None = None
+    dag: Stages, recipe: str | Document = "default", overrides: Sequence[str] = (), seed: int | None = None
 ) -> Config:
     """Return the checked configuration of a recipe: a name, the path of a TOML file, or a document.
 
@@ -132,7 +132,7 @@ def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> Document:
     return merged
 
 
-def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
+def check_document(dag: Stages, document: Mapping[str, Any]) -> Config:
     """Check a document with the stages' models and fill in the defaults. Raises ConfigError."""
     seed = document.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
@@ -143,20 +143,48 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
     for name in document:
         if name != "seed" and name not in models:
             raise _unknown_setting(name, models)
+    sections = _checked(models, document)
+    used = sections
+    for name in (recipe for model in sections.values() for recipe in laid_over(model)):
+        used = _checked(models, merge(document, _limited(read_recipe(name), sections)))
+    return Config(seed, sections, used)
+
+
+def laid_over(model: BaseModel) -> Iterator[str]:
+    """Yield the names of recipes that a value of a setting selects.
+
+    Such a setting is declared with ``json_schema_extra={"recipes": [VALUE]}``. The recipe ``VALUE`` is then
+    laid over the settings.
+    """
+    for _, field, value in fields_of(model):
+        extra = field.json_schema_extra
+        if isinstance(extra, dict) and value in cast(list[str], extra.get("recipes", [])):
+            yield value
+
+
+def _limited(recipe: Document, own: Mapping[str, BaseModel]) -> Document:
+    """Return ``recipe`` with the limits (settings ``max_...``) of ``own`` where these are lower."""
+    return {
+        stage: {
+            name: min(value, getattr(own[stage], name)) if name.startswith("max_") else value
+            for name, value in table.items()
+        }
+        for stage, table in recipe.items()
+        if stage in own
+    }
+
+
+def _checked(models: Mapping[str, type[BaseModel]], document: Mapping[str, Any]) -> dict[str, BaseModel]:
     sections: dict[str, BaseModel] = {}
     for name, model in models.items():
         try:
             sections[name] = model.model_validate(document.get(name, {}))
         except ValidationError as error:
             raise _setting_error(name, models, error) from error
-    effective: dict[str, BaseModel] = {}
-    for name, config in sections.items():
-        change = getattr(dag.load(name), "effective", None)
-        effective[name] = config if change is None else change(config, sections)
-    return Config(seed, sections, effective)
+    return sections
 
 
-def known_settings(dag: Dag, document: Mapping[str, Any]) -> tuple[Document, list[str]]:
+def known_settings(dag: Stages, document: Mapping[str, Any]) -> tuple[Document, list[str]]:
     """Return the settings of ``document`` that this version has, and the names of the others.
 
     The file of a run that another version wrote may have others.
@@ -174,11 +202,12 @@ def _known(table: Any, model: Any, place: str, others: list[str]) -> Any:
     """Return ``table`` without the settings that ``model`` does not have, which are added to ``others``."""
     if not (isinstance(table, dict) and isinstance(model, type) and issubclass(model, BaseModel)):
         return table
-    others += [f"{place}.{name}" for name in table if name not in model.model_fields]
+    names = {old: name for name, field in model.model_fields.items() for old in (name, *former_names(field))}
+    others += [f"{place}.{name}" for name in table if name not in names]
     return {
-        name: _known(table[name], field.annotation, f"{place}.{name}", others)
-        for name, field in model.model_fields.items()
-        if name in table
+        names[name]: _known(value, model.model_fields[names[name]].annotation, f"{place}.{name}", others)
+        for name, value in table.items()
+        if name in names
     }
 
 

@@ -61,10 +61,11 @@ def plugin_versions(config: BaseModel) -> dict[str, str]:
     for name, field, value in fields_of(config):
         extra = field.json_schema_extra
         if isinstance(extra, dict) and "plugin" in extra and value != field.default:
-            found = plugins(cast(ExtensionPoint, extra["plugin"])).get(value)
-            if found is not None:
-                distribution, version = package_of(found)
-                versions[f"{distribution} for {name}={value}"] = version
+            external = plugins(cast(ExtensionPoint, extra["plugin"]))
+            for part in value if isinstance(value, tuple) else (value,):
+                if part in external:
+                    distribution, version = package_of(external[part])
+                    versions[f"{distribution} for {name}={part}"] = version
     return versions
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from cleargs.errors import CleargsError, InputError
 from cleargs.named_views import VIEWS
 from cleargs.packed import PACK
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, known_metadata, read_run_file
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import ROOTS, STORE_FOLDER
 
 OWN = (RUN_FILE, SCENE, LOCK, PACK, STORE_FOLDER, "run.log", VIEWS, "report.html", "report")
@@ -28,7 +28,7 @@ CAPTURE = ("images", "masks", "sparse", "colmap")
 
 def check_outputs(
     outputs: Iterable[Path],
-    dag: Dag,
+    dag: Stages,
     run: Path | None = None,
     *,
     inputs: Iterable[Path] = (),
@@ -53,7 +53,7 @@ def check_outputs(
 
 
 def _protected(
-    output: Path, dag: Dag, run: Path | None, inputs: Iterable[Path]
+    output: Path, dag: Stages, run: Path | None, inputs: Iterable[Path]
 ) -> Iterator[tuple[Path, str]]:
     """Yield the places in which ``output`` may not be, and their meanings."""
     yield from ((place, "an input of this command") for place in inputs)
@@ -67,14 +67,14 @@ def _protected(
             yield from ((place, f"an input of the run {one}") for place in _inputs_of(one, dag, one == run))
 
 
-def own_places(run: Path, dag: Dag, store: Path | None = None) -> Iterator[Path]:
+def own_places(run: Path, dag: Stages, store: Path | None = None) -> Iterator[Path]:
     """Yield the files and folders of ``run`` and its ``store`` (default: that in ``run.toml``)."""
     yield from (run / name for name in (*OWN, *dag.names))
     if store := store or known_metadata(run).store:
         yield from (store / name for name in (*dag.names, ROOTS, "work", "kept", "locks", "digests.sqlite"))
 
 
-def _inputs_of(run: Path, dag: Dag, whole: bool) -> Iterator[Path]:
+def _inputs_of(run: Path, dag: Stages, whole: bool) -> Iterator[Path]:
     """Yield the capture of ``run`` and the other files that its stages read outside the store.
 
     With ``whole``, all of a folder that was given as the capture counts, unless the run is in it.

@@ -16,11 +16,11 @@ from cleargs.errors import InputError, StoreError
 from cleargs.files import External
 from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
 from cleargs.packed import require_images
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
 from cleargs.pipeline.outputs import Place, own_places
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate, StageContext
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Entry, Store, WorkFolder
 from cleargs.progress import Reporter
 from cleargs.safe_io import require_utf8
@@ -86,7 +86,7 @@ class StagePlan:
 class Planner:
     """Computes keys and compares them with the store and the run folder. Writes nothing."""
 
-    dag: Dag
+    dag: Stages
     run: RunSpec
     store: Store
     threads: int

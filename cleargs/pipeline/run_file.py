@@ -13,7 +13,7 @@ from cleargs.files import disk_errors, write_bytes
 from cleargs.named_views import VIEWS
 from cleargs.own_files import nodes_below, refuse_links
 from cleargs.pipeline.config import Config, Document, check_document, known_settings, read_toml
-from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import ROOTS, STORE_FOLDER, copied_key
 from cleargs.types import Device
 
@@ -60,8 +60,8 @@ class RunSpec:
     falls_back: bool = field(default=False, compare=False)
     """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
 
-    def stages(self, dag: Dag) -> tuple[str, ...]:
-        """Return the stages that have work with the settings of the run: a draft has no repairs."""
+    def stages(self, dag: Stages) -> tuple[str, ...]:
+        """Return the stages that have work with the settings of the run."""
         idle = {name: getattr(dag.load(name), "idle", None) for name in dag.names}
         return tuple(name for name, check in idle.items() if not (check and check(self.config.effective)))
 
@@ -189,7 +189,7 @@ def located(folder: Path) -> Path:
 
 
 def read_run_file(
-    folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None
+    folder: Path, dag: Stages, *, store: Path | None = None, device: Device | None = None
 ) -> RunSpec:
     """Read the run in ``folder``. ``store`` and ``device`` replace those in ``run.toml``.
 

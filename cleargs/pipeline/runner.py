@@ -29,7 +29,6 @@ from cleargs.manifest import (
     write_manifest,
 )
 from cleargs.own_files import drop_links
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import exclusive_lock
 from cleargs.pipeline.plan import (
@@ -44,6 +43,7 @@ from cleargs.pipeline.plan import (
     rerun_lines,
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, known_metadata, write_run_file
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Entry, Store, copied_key
 
 BUSY = 1.5
@@ -318,7 +318,7 @@ class Runner(Planner):
         return changed
 
 
-def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
+def check_same_input(run: RunSpec, dag: Stages, store: Store) -> None:
     """Raise InputError if ``run.folder`` is a run of another capture than ``run.source``.
 
     A capture at another path is the same if its content is equal.

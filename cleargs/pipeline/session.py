@@ -13,7 +13,6 @@ from cleargs.errors import ConfigError, InputError, listed
 from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
 from cleargs.packed import require_images
 from cleargs.pipeline.config import check_document, known_settings, load_config
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
     RUN_FILE,
     RunMetadata,
@@ -25,6 +24,7 @@ from cleargs.pipeline.run_file import (
     read_metadata,
     require_store,
 )
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import MEMO, STORE_FOLDER, Store, check_store, is_store, visible_names
 from cleargs.progress import Reporter
 from cleargs.types import Device
@@ -101,7 +101,7 @@ def default_folder(source: Path) -> Path:
 
 
 def resolve_run(
-    dag: Dag,
+    dag: Stages,
     source: Path,
     folder: Path,
     *,

@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel
+from pydantic import AliasChoices, BaseModel
 from pydantic.fields import FieldInfo
 
 TYPE_NAMES: Mapping[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
@@ -67,6 +67,12 @@ def fields_of(model: BaseModel, prefix: str = "") -> Iterator[tuple[str, FieldIn
             yield prefix + name, field, value
 
 
+def former_names(field: FieldInfo) -> list[str]:
+    """Return the names that a setting had in older versions, which are still read."""
+    alias = field.validation_alias
+    return [str(name) for name in alias.choices[1:]] if isinstance(alias, AliasChoices) else []
+
+
 def flattened(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield dotted name and value of each setting in nested tables."""
     for name, value in tables.items():
@@ -84,7 +90,8 @@ def allowed(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     if origin is Literal:
         words = " or ".join(map(str, parts))
     elif origin is tuple:
-        words = f"{len(parts)} values, each {allowed(parts[0])}"
+        count = "any number of" if parts[-1] is Ellipsis else len(parts)
+        words = f"{count} values, each {allowed(parts[0])}"
     elif origin in (Union, UnionType):
         words = " or ".join(allowed(kind) for kind in parts if kind is not NoneType)
     else:

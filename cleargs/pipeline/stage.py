@@ -99,10 +99,9 @@ class Stage(Protocol):
     LIBRARIES: tuple[str, ...]
     """Distributions that affect the results. Their versions are part of the key.
 
-    A stage may also have a function ``other_libraries(device, config)``, which returns name -> version of
-    those that only this device or these settings use. It may have a function ``effective(config, sections)``,
-    which returns its settings as those of other stages change them, and a function ``idle(sections)``, which
-    is True if the settings leave it nothing to do.
+    A stage may also have a function ``other_libraries(device, config)``, which returns versions of libraries
+    used only on this device or with these settings, and a function ``idle(sections)``, which is True if the
+    settings leave it nothing to do.
     """
 
     def externals(self, config: Any, source: Path) -> Mapping[str, External]:

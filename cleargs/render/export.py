@@ -15,18 +15,19 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Similarity, upright
 from cleargs.capture.model import read_model, transform_model, write_model
+from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_bytes, write_json
-from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
 from cleargs.named_views import NamedView, read_views
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
+from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.run_results import edited_scene, scene_path
+from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
 from cleargs.splat.ply import read_ply
@@ -225,7 +226,7 @@ def _similarity(
     similarity: dict[str, Any] = {}
     if options.world == "input":
         manifest = linked_manifest(ingest.parent, ingest.name)
-        world = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
+        world = Similarity.from_json(IngestSummary.of(manifest).similarity, ingest)
         similarity = {"scale": world.scale, "rotation": world.rotation.T, "translation": world.origin}
     else:
         stand = np.eye(3) if options.upright is None else upright(_direction(options.upright, cameras))

@@ -15,15 +15,14 @@ from torch import Tensor
 
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
-from cleargs.formation.dust import contributions
-from cleargs.formation.exposure import read_exposure
-from cleargs.formation.frames import real_views
-from cleargs.formation.observed import evaluate_views
-from cleargs.formation.table import read_formation
 from cleargs.packed import read_pack
 from cleargs.parquet import read_table
 from cleargs.progress import Reporter
 from cleargs.rva.tables import FRAMES
+from cleargs.scene.dust import contributions
+from cleargs.scene.folder import SceneFolder
+from cleargs.scene.measure import evaluate_views
+from cleargs.scene.views import real_views
 from cleargs.splat.backend import mean_psnr, rasteriser_for
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import TrainingView
@@ -136,8 +135,8 @@ def training_psnr(
     scene: Scene, views: Sequence[TrainingView], folder: Path, advance: Callable[[], None] = lambda: None
 ) -> float:
     """Return the mean PSNR of ``views`` in dB, with the image formation of the stage in ``folder``."""
-    exposure = read_exposure(folder / "exposure.parquet")
-    formations, _ = read_formation(folder / "formation.parquet")
+    files = SceneFolder(folder)
+    exposure, (formations, _) = files.exposure(), files.formations()
     engine, values = rasteriser_for(), []
     for view in views:
         (fit,) = evaluate_views(scene, [view], exposure, formations, engine=engine)

@@ -11,20 +11,21 @@ from typing import Any, Literal
 import numpy as np
 
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
+from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
-from cleargs.formation.frames import camera_of
 from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
 from cleargs.packed import require_images
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
+from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.render.output import Kind, Shot, kind_of, write_shots
 from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.run_results import edited_scene, scene_path
 from cleargs.safe_io import FAULTS, cause, read_json
+from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.formats import read_scene
 
@@ -145,7 +146,7 @@ def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
     filmed: list[Frame] = []
     if options.poses is not None:
         manifest = linked_manifest(ingest.parent, ingest.name)
-        similarity = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
+        similarity = Similarity.from_json(IngestSummary.of(manifest).similarity, ingest)
         cameras = read_poses(options.poses, lens, similarity, options.world)
     elif options.turntable:
         cameras = [replace(lens, world_to_camera=pose) for pose in turntable(own, count)]

@@ -15,18 +15,20 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
+from cleargs.capture.summary import IngestSummary
 from cleargs.errors import CleargsError
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config, load_config, recipe_names
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
+from cleargs.pipeline.stages import Stages
 from cleargs.program import program
 from cleargs.progress import SilentReporter
 from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
-from cleargs.report.outcome import figure_of, short_training
+from cleargs.report.outcome import short_training
+from cleargs.rivr.summaries import G0Summary
 
 FEW_PLACED = 0.8
 """Share of frames with a pose below which the report gives advice on the other frames."""
@@ -75,7 +77,7 @@ def shown_advice(
     ]
 
 
-def command(run: RunSpec, dag: Dag) -> str:
+def command(run: RunSpec, dag: Stages) -> str:
     """Return the ``cleargs run`` command that reproduces a run, as called in the parent of its folder."""
     recipe, changed = _nearest_recipe(run.config, dag)
     words = ["--recipe", recipe] if recipe != "default" else []
@@ -90,7 +92,7 @@ def _command(run: RunSpec, options: Sequence[str]) -> str:
     return f"{program(place)} {shlex.join(words)}"
 
 
-def _nearest_recipe(config: Config, dag: Dag) -> tuple[str, dict[str, Any]]:
+def _nearest_recipe(config: Config, dag: Stages) -> tuple[str, dict[str, Any]]:
     """Return the recipe from which the fewest settings differ, and these settings."""
     settings = dict(flattened(config.document()))
     candidates = []
@@ -140,7 +142,7 @@ def _on_frames(
 ) -> Iterator[Advice]:
     ingest: Any = config.sections["ingest"]
     unplaced = sum(row.role == UNPLACED for row in rows)
-    available = figure_of(manifests, "ingest", "frames_available") or 0
+    available = IngestSummary.of(manifests.get("ingest")).frames_available or 0
     more: dict[str, Any] = {}  # the setting that limits the number of frames, if the capture has more
     if available > len(rows):
         if ingest.fps is not None and len(rows) < ingest.max_frames:
@@ -212,8 +214,9 @@ def _on_training(
         why = "Larger images show finer detail, if the video has it."
         larger = tuple(_set({"ingest.max_size": size * 3 // 2}))
         yield Advice(f"Images were reduced to {size} px", why, NO_FIGURE, 0.5, larger)
-    spread = figure_of(manifests, "g0", "exposure_spread") or 0.0
-    if spread > g0.exposure_threshold and not figure_of(manifests, "g0", "exposure"):
+    trained = G0Summary.of(manifests.get("g0"))
+    spread = trained.exposure_spread or 0.0
+    if spread > g0.exposure_threshold and not trained.exposure:
         what = f"Exposure differs by {100 * spread:.0f} % between frames"
         why = "Without compensation the scene averages the exposures, which causes floating haze."
         yield Advice(what, why, NO_FIGURE, 0.8, tuple(_set({"g0.exposure": "auto"})))

@@ -9,29 +9,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from cleargs.capture.measuring import MOTION
 from cleargs.capture.tables import Frame, load_frames
-from cleargs.formation.exposure import read_exposure
-from cleargs.formation.movement import read_movement
 from cleargs.formation.table import FORMATION
-from cleargs.parquet import read_any_table, read_table
-from cleargs.rivr.distillation import TrainedScene
+from cleargs.parquet import read_table
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
-from cleargs.splat.tables import TRAIN
+from cleargs.scene.folder import SceneFolder
+from cleargs.scene.viewer import SceneViewer
 from cleargs.types import ArrayF64, MaskBool
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles, on the page, of frames that RVA does not rate."""
-
-CHOICES = {
-    "render": "the render",
-    "restored": "the restored frame",
-    "fused": "the fusion of render and restored frame",
-    "observed": "kept as filmed",
-}
-"""Candidate -> its description in the report."""
 
 EFFECTS = {
     "blur": ("motion blur", "blur_px"),
@@ -148,23 +139,19 @@ def faults_of(rated: Mapping[str, Any]) -> dict[str, float]:
     return faults | {name: value for name, value in harms.items() if value is not None}
 
 
-def scene_with_models(rows: Sequence[FrameRow], run: Path, stages: Collection[str]) -> TrainedScene | None:
+def scene_with_models(rows: Sequence[FrameRow], run: Path, stages: Collection[str]) -> SceneViewer | None:
     """Return the last scene of ``run`` if it has a model of image formation for any of ``rows``, else None.
 
     Raises StoreError if a file of the scene is damaged.
     """
     last = last_scene(stages)
-    return TrainedScene(run / last) if last and any(row.modelled for row in rows) else None
+    return SceneViewer(run / last) if last and any(row.modelled for row in rows) else None
 
 
 def scores_of(selection: Selection) -> list[tuple[str, dict[str, float]]]:
     """Return the deciding scorer, then the scorer for ties, each as (name, candidate -> score)."""
-    found = []
-    for use in ("primary", "tiebreak") if selection.exr is not None else ():
-        scores = {name: getattr(selection, f"{use}_{name}") for name in CHOICES}
-        known = {name: score for name, score in scores.items() if score is not None}
-        found.append((getattr(selection, f"{use}_metric"), known))
-    return found
+    uses = ((selection.primary_metric, selection.primary), (selection.tiebreak_metric, selection.tiebreak))
+    return [(metric, dict(scores)) for metric, scores in uses if metric is not None]
 
 
 SCENES = ("g0", "rivr", "consolidate")
@@ -189,18 +176,15 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     if "rivr" in stages:
         for found in sorted(read_selection(run / "rivr" / "selection.parquet"), key=lambda row: row.round):
             rounds.setdefault(found.frame_id, []).append(found)
-    psnr = _last_psnr([run / stage / "train.parquet" for stage in SCENES if stage in stages])
+    psnr = _last_psnr([SceneFolder(run / stage).log() for stage in SCENES if stage in stages])
     affines: dict[int, ArrayF64] = {}
     formation: dict[int, dict[str, Any]] = {}  # stays empty if image formation is off
     moving: dict[int, MaskBool] = {}
     if final := last_scene(stages):
-        if (path := run / final / "movement.parquet").is_file():
-            moving = read_movement(path)
-        exposure = read_exposure(run / final / "exposure.parquet")
+        scene = SceneFolder(run / final)
+        moving, formation, exposure = scene.moving(), scene.formation_rows(), scene.exposure()
         if exposure.enabled:
             affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
-        if (path := run / final / "formation.parquet").is_file():
-            formation = {row.pop("frame_id"): row for row in read_any_table(path).to_pylist()}
     speeds: dict[int, float] = {}
     if (path := run / "ingest" / "motion.parquet").is_file():
         for row in read_table(path, MOTION).to_pylist():
@@ -221,10 +205,10 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     ]
 
 
-def _last_psnr(tables: Sequence[Path]) -> dict[int, float]:
+def _last_psnr(logs: Sequence[pa.Table | None]) -> dict[int, float]:
     """Return frame_id -> median PSNR of the last `LAST_STEPS` steps on the raw frame at its full size."""
     steps: dict[int, list[tuple[int, float]]] = {}
-    for table in (read_table(path, TRAIN) for path in tables if path.is_file()):
+    for table in filter(None, logs):
         columns = (table[name].to_pylist() for name in ("frame_id", "kind", "width", "psnr"))
         for frame_id, kind, width, psnr in zip(*columns, strict=True):
             if kind == "real" and math.isfinite(psnr):

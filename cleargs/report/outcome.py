@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from cleargs.manifest import Manifest
 from cleargs.report.formatting import count
 from cleargs.report.frames import SCENES, FrameRow
+from cleargs.rivr.summaries import ConsolidateSummary, G0Summary, RepairSummary, TrainingSummary
 from cleargs.splat.config import steps_from_frames
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
@@ -41,17 +42,9 @@ class Outcome(NamedTuple):
     """PSNR in dB of pixels that no training used; "" if it is unknown."""
 
 
-def figure_of(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
-    """Return a figure from the summary of a stage; None without the stage or the figure."""
-    value: Any = manifests[stage].summary if stage in manifests else None
-    for name in path:
-        value = value.get(name) if isinstance(value, Mapping) else None
-    return value
-
-
 def outcome(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: Sequence[float]) -> Outcome:
     """Return the first lines of a report. ``unseen`` is the PSNR, dB, of each frame that was held out."""
-    known = [figure_of(manifests, stage, "psnr_unseen") for stage in reversed(SCENES)]
+    known = [TrainingSummary.of(manifests.get(stage)).psnr_unseen for stage in reversed(SCENES)]
     psnr = next((value for value in known if value is not None), None)
     text = _text(manifests, rows, unseen)
     if psnr is None:
@@ -67,7 +60,7 @@ def outcome(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen:
 
 def short_training(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> tuple[int, int] | None:
     """Return the steps of the first training and the standard number, if it had less than `SHORT` of them."""
-    steps = figure_of(manifests, "g0", "steps") or 0
+    steps = G0Summary.of(manifests.get("g0")).steps or 0
     standard = steps_from_frames(sum(bool(row.weight) for row in rows))
     return (steps, standard) if "g0" in manifests and steps < SHORT * standard else None
 
@@ -80,10 +73,11 @@ def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: S
         used = [row for row in rows if row.weight]
         simulated = sum(row.modelled for row in used)
         parts.append(f"{len(used)} used in training, {simulated} with simulated blur or defocus")
-    repaired = figure_of(manifests, "consolidate", "repairs")
+    repaired = ConsolidateSummary.of(manifests.get("consolidate")).repairs
     if repaired is not None:
         parts.append(f"{repaired} repaired")
-    if any(figure_of(manifests, stage, "held_back", "harm") for stage in SCENES):
+    checks = [RepairSummary.of(manifests.get(stage)).control for stage in SCENES]
+    if any(check is not None and check.harm for check in checks):
         parts.append("a scene with repairs was rejected, since it matched other frames worse")
     if unseen:
         held = f"{count(len(unseen), 'frame')} that {'was' if len(unseen) == 1 else 'were'} held out"

@@ -18,17 +18,14 @@ from rich.filesize import decimal
 import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder, write_bytes
-from cleargs.formation.frames import camera_of
 from cleargs.manifest import plain_json
 from cleargs.named_views import read_views
-from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.program import program
 from cleargs.report.advice import command, shown_advice, toml_text
 from cleargs.report.formatting import duration
 from cleargs.report.frames import (
-    CHOICES,
     MEANINGS,
     SCENES,
     FrameRow,
@@ -51,9 +48,11 @@ from cleargs.report.report_json import (
 )
 from cleargs.report.single_file import single_file_size
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
+from cleargs.rivr.candidates import phrase_of
 from cleargs.run_results import edited_scene
+from cleargs.scene.folder import SCENE, SceneFolder
+from cleargs.scene.views import camera_of
 from cleargs.splat.backend import set_threads
-from cleargs.splat.ply import read_ply
 from cleargs.splat.render import Viewer
 from cleargs.splat.scene import Scene
 from cleargs.splat.tables import TRAIN
@@ -153,7 +152,7 @@ def write_report(planner: Planner, edited: Path | None = None) -> Path:
             program=program(run.parent),
             aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
             data={
-                "layers": LAYERS,
+                "layers": {name: name for found in pictures.values() for name in found.layers} | LAYERS,
                 "meanings": MEANINGS,
                 "opening": {"left": "observed", "right": "final"},
                 "poor": LOOSE_DB,
@@ -180,8 +179,7 @@ def _write_scene(
     """
     camera = camera_of(opening_frame(placed).frame)
     still = camera.scaled(_STILL / max(camera.width, camera.height))
-    file = run / stage / "scene.ply"
-    scene = edited or read_ply(file)
+    scene = edited or SceneFolder(run / stage).scene()
     renderer = Viewer(scene)
     data = {
         "gaussians": scene.gaussians.num,
@@ -190,8 +188,8 @@ def _write_scene(
         "shown_degree": write_scene(folder / "scene.js", "scene", scene),
         "antialias": scene.antialias,
         "background": scene.background,
-        "file": f"../{stage}/scene.ply",
-        "bytes": file.stat().st_size,
+        "file": f"../{stage}/{SCENE}",
+        "bytes": (run / stage / SCENE).stat().st_size,
     }
     return data, renderer
 
@@ -209,7 +207,7 @@ def frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> di
     """Return the data of a frame for the page; ``time`` is its time in the viewer's animation, in seconds."""
     repair, why, scores = "none tried", "", {}
     if row.selection:
-        choice = CHOICES[row.selection.chosen]
+        choice = phrase_of(row.selection.chosen)
         refused = row.selection.chosen != "observed" and not row.chosen
         repair = f"kept as filmed, since {choice} was refused" if refused else choice
         scores = dict(scores_of(row.selection))
@@ -251,8 +249,8 @@ def training_curves(run: Path, stages: Sequence[str]) -> dict[str, Any] | None:
     Loss and PSNR are those of steps on raw frames. They are medians over equal intervals: each step shows one
     view, and views differ more than steps. Raises StoreError if a table cannot be read.
     """
-    paths = [(stage, run / stage / "train.parquet") for stage in stages]
-    tables = {stage: read_table(path, TRAIN) for stage, path in paths if path.is_file()}
+    logs = {stage: SceneFolder(run / stage).log() for stage in stages}
+    tables = {stage: log for stage, log in logs.items() if log is not None}
     steps = pa.concat_tables([TRAIN.empty_table(), *tables.values()])
     real = np.array(steps["kind"].to_pylist()) == "real"
     if not real.any():

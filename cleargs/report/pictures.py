@@ -14,13 +14,14 @@ import numpy as np
 from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.metrics import psnr as psnr_of
 from cleargs.formation.frame import from_row
-from cleargs.formation.frames import camera_of, view_of
 from cleargs.formation.motion import pixel_paths
 from cleargs.formation.movement import still_pixels
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_mask, read_rgb, reduced, to_uint8
 from cleargs.report.frames import HELD_OUT, FrameRow
-from cleargs.rivr.distillation import TrainedScene
+from cleargs.rivr.candidates import CANDIDATES
+from cleargs.scene.viewer import SceneViewer
+from cleargs.scene.views import camera_of, view_of
 from cleargs.splat.render import Viewer
 from cleargs.types import ImageU8, MaskBool
 
@@ -29,9 +30,7 @@ LAYERS = {
     "paths": "Paths during the exposure",
     "explained": "Render with camera effects",
     "deblurred": "Deblurred",
-    "restored": "Restored",
-    "fused": "Fused",
-    "render": "Scene before repair",
+    **{name: CANDIDATES[name].label for name in reversed([*CANDIDATES])},
     "masked": "Not used: masked",
     "moving": "Not used: moves",
     "final": "Final scene",
@@ -77,7 +76,7 @@ def write_pictures(
     run: Path,
     report: Path,
     final: Viewer | None,
-    scene: TrainedScene | None,
+    scene: SceneViewer | None,
     threads: int,
 ) -> dict[int, FramePictures]:
     """Write the thumbnails and layers of all frames. Return frame_id -> image files.
@@ -114,7 +113,7 @@ def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -
 
 
 def formed_layers(
-    row: FrameRow, run: Path, scene: TrainedScene | None, side: int | None = None
+    row: FrameRow, run: Path, scene: SceneViewer | None, side: int | None = None
 ) -> dict[str, ImageU8]:
     """Return the layers that image formation gives for a frame without an EXR; none without a model of it.
 
@@ -167,7 +166,7 @@ def _write_frame(
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
-    names = [layer for layer in LAYERS if layer in images]
+    names = [layer for layer in dict.fromkeys((*LAYERS, *images)) if layer in images]
     layers = {layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side) for layer in names}
     unseen = _aligned_psnr(final, images["observed"]) if final is not None and row.role == HELD_OUT else None
     return FramePictures(write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers, unseen)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cleargs
+from cleargs.capture.summary import IngestSummary
 from cleargs.errors import StoreError, listed
 from cleargs.files import remove, write_json
 from cleargs.manifest import Manifest, linked_manifest
@@ -96,13 +97,13 @@ def cameras_of(manifests: Mapping[str, Manifest]) -> dict[str, Any]:
     """
     if (ingest := manifests.get("ingest")) is None:
         return {}
-    errors = ingest.summary.get("kept_out_matches_off_px") or {}
-    origin = {"input": "given", "refined": "adjusted"}.get(ingest.summary.get("poses", ""), "sfm")
+    found = IngestSummary.of(ingest)
+    errors, origin = found.kept_out_matches_off_px or {}, found.poses or "sfm"
     return {
         "method": "sfm over given" if origin == "sfm" and errors else origin,
         "off_px_before": errors.get("given"),
         "off_px": errors.get(origin),
-        "kept_out": ingest.summary.get("kept_out"),
-        "lenses": ingest.summary.get("cameras"),
-        "placed": ingest.summary.get("placed"),
+        "kept_out": found.kept_out,
+        "lenses": found.cameras,
+        "placed": found.placed,
     }

@@ -24,9 +24,9 @@ from urllib.parse import urlsplit
 
 from cleargs.errors import InputError
 from cleargs.manifest import plain_json
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage, stage_at_work
 from cleargs.pipeline.run_file import RunSpec
+from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import FOLDER, PAGE, is_current, linked_manifests, page_of
 from cleargs.safe_io import faults_as, open_own
 
@@ -42,7 +42,7 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, dag: Dag, run: RunSpec, host: str, port: int) -> None:
+    def __init__(self, dag: Stages, run: RunSpec, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         hint = "choose another --port (0: any free port), or a --host of this machine"
         with faults_as(InputError, f"cannot serve at {host}:{port}", hint=hint, faults=(OSError,)):
@@ -68,7 +68,7 @@ class _Handler(SimpleHTTPRequestHandler):
     server_version, sys_version = "cleargs", ""
     timeout = 30
 
-    def __init__(self, dag: Dag, run: RunSpec, host: str, *arguments: Any) -> None:
+    def __init__(self, dag: Stages, run: RunSpec, host: str, *arguments: Any) -> None:
         self._dag, self._run, self._host, self.path = dag, run, host, ""
         super().__init__(*arguments, directory=str(run.folder))
 

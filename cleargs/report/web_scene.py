@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from cleargs.formation.frames import camera_of
 from cleargs.named_views import NamedView
 from cleargs.report.frames import FrameRow
+from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES

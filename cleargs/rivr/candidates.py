@@ -1,29 +1,69 @@
 """The candidates of a target frame t (the paper's Table "RIVR candidates"), and the choice between them.
 
-They are the render R_t, the restored frame D_t and the fusion F_t of both. O_t is the raw frame. The primary
-scorer decides (MUSIQ in the paper). If the best two of its scores are within a margin, the tie-break scorer
-(CLIP-IQA in the paper) decides among the candidates within it. Images are [H, W, 3] float32 sRGB in [0, 1].
+`CANDIDATES` has one entry for each. O_t is the raw frame. Images are [H, W, 3] float32 sRGB in [0, 1].
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from cleargs.plugins import load_plugin
 from cleargs.types import ArrayF64, ImageF32
-
-CandidateName: TypeAlias = Literal["render", "restored", "fused"]
-Chosen: TypeAlias = Literal["render", "restored", "fused", "observed"]
-"""A candidate, or the raw frame O_t if it needs no repair."""
 
 Source: TypeAlias = Literal["observation", "deblurred", "render"]
 """Image that the expert restored to D_t: O_t, O_t without the camera's motion, or R_t."""
 
-CANDIDATES: tuple[CandidateName, ...] = ("render", "restored", "fused")
-"""R_t, D_t and F_t; in a perfect tie the earlier one is chosen."""
+Scores: TypeAlias = Mapping[str, float]
+"""Candidate, or `OBSERVED` -> its score, 0-100, higher is better."""
+
+OBSERVED = "observed"
+"""Name of the raw frame O_t among the choices and the layers of an EXR."""
+
+
+class Materials(NamedTuple):
+    """The images that a candidate may be made from, as read back from the EXR."""
+
+    render: ImageF32
+    """R_t."""
+    restored: ImageF32
+    """D_t."""
+    observed: ImageF32
+    """O_t."""
+    sigma: float
+    """``rivr.fuse_sigma``, px."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One kind of repair."""
+
+    label: str
+    """Its name on the report's page."""
+    phrase: str
+    """Its name in a sentence."""
+    make: Callable[[Materials], ImageF32]
+
+
+CANDIDATES: Mapping[str, Candidate] = {
+    "render": Candidate("Scene before repair", "the render", lambda images: images.render),
+    "restored": Candidate("Restored", "the restored frame", lambda images: images.restored),
+    "fused": Candidate(
+        "Fused",
+        "the fusion of render and restored frame",
+        lambda images: fuse(images.render, images.restored, images.sigma),
+    ),
+}
+"""Name, which is also that of the layer in the EXR -> candidate. In a perfect tie the earlier one is chosen.
+
+Render and restored frame are always made, the others if ``rivr.candidates`` names them.
+"""
+
+ALWAYS = ("render", "restored")
+"""Candidates of every target frame."""
 
 NEGLIGIBLE = 0.15
 """Squared change by a repair, over the squared error of the render, below which there is nothing to repair
@@ -34,6 +74,27 @@ EXPLAINED = "explained: "
 
 KEPT = "needs no repair"
 """Reason in a row whose raw frame is kept."""
+
+MASKED = "every pixel of the frame is masked"
+"""Reason in a row without a usable pixel."""
+
+REFUSED = "repair refused: "
+"""Prefix of the reason of a choice if the repair was refused as a candidate."""
+
+
+def candidate(name: str) -> Candidate:
+    """Return the candidate ``name`` of `CANDIDATES` or of another package.
+
+    Raises InputError if no package provides it.
+    """
+    found: Candidate = CANDIDATES[name] if name in CANDIDATES else load_plugin("candidates", name)
+    return found
+
+
+def phrase_of(chosen: str) -> str:
+    """Return the name of a choice in a sentence; of a candidate of another package, its plain name."""
+    phrases = {name: known.phrase for name, known in CANDIDATES.items()} | {OBSERVED: "kept as filmed"}
+    return phrases.get(chosen, chosen)
 
 
 def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
@@ -55,34 +116,57 @@ def gaussian_blur(image: ImageF32, sigma: float) -> ArrayF64:
 
 
 @dataclass(frozen=True)
-class CandidateChoice:
-    """The chosen candidate and the reason."""
+class Decision:
+    """The supervision of a frame."""
 
-    chosen: CandidateName
+    chosen: str
+    """A candidate, or `OBSERVED`: the raw frame."""
+    accepted: bool
+    """True if the chosen candidate becomes a pseudo observation."""
     reason: str
 
 
-def choose(
-    primary: Mapping[CandidateName, float], tiebreak: Mapping[CandidateName, float], margin: float
-) -> CandidateChoice:
-    """Choose the candidate with the highest primary score; the tie-break decides within ``margin``.
+def decide(
+    primary: Scores,  # scores of the candidates, and of the raw frame if it may be kept
+    tiebreak: Scores,
+    margin: float,
+    *,
+    masked: bool = False,  # True if no pixel of the frame counts
+    explained: str | None = None,  # the effect that explains the frame; None: none does, or not well enough
+    negligible: bool = False,  # True if the repair changes so little that an unbeaten raw frame is kept
+    refused: str | None = None,  # why a gate refuses the restored frame
+) -> Decision:
+    """Decide what supervises a frame; the first row that holds gives the reason.
 
-    If tie-break scores are equal, the higher primary score wins, then the order of `CANDIDATES`. ValueError
-    is raised if a score is not finite.
+    | case | chosen | accepted |
+    |---|---|---|
+    | masked | as in the rows below | no |
+    | explained, and it may be kept | raw frame | no |
+    | negligible, no score beats the raw frame's by more than ``margin`` | raw frame | no |
+    | refused | render: all other candidates contain the refused repair | yes |
+    | else | highest primary score; the tie-break decides within ``margin`` of it | yes |
+
+    If tie-break scores are equal, the higher primary score wins, then the earlier candidate. ValueError is
+    raised if a score is not finite.
     """
     if not np.isfinite([*primary.values(), *tiebreak.values()]).all():
         raise ValueError(f"scores must be finite: primary {dict(primary)}, tie-break {dict(tiebreak)}")
-    best = max(primary.values())
-    close = [name for name in CANDIDATES if name in primary and best - primary[name] <= margin]
-    if len(close) == 1:
-        return CandidateChoice(close[0], "primary score")
-    chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))
-    return CandidateChoice(chosen, "tie-break among " + ", ".join(close))
-
-
-def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: float) -> bool:
-    """Return True if no candidate's score exceeds that of the raw frame by more than ``margin``."""
-    return max(candidates.values()) - raw <= margin
+    names = [name for name in primary if name != OBSERVED]
+    kept = None
+    if OBSERVED in primary:
+        gains = (scores[name] - scores[OBSERVED] for scores in (primary, tiebreak) for name in names)
+        beaten = any(gain > margin for gain in gains)
+        kept = f"{EXPLAINED}{explained}" if explained else KEPT if negligible and not beaten else None
+    if kept is not None:
+        chosen, reason = OBSERVED, kept
+    elif refused is not None:
+        chosen, reason = "render", f"{REFUSED}{refused}"
+    else:
+        best = max(primary[name] for name in names)
+        close = [name for name in names if best - primary[name] <= margin]
+        chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))
+        reason = "primary score" if len(close) == 1 else "tie-break among " + ", ".join(close)
+    return Decision(chosen, accepted=not masked and kept is None, reason=MASKED if masked else reason)
 
 
 def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF32) -> bool:

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from cleargs.base_model import FrozenModel
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.types import ArrayF64, ImageF32, MaskBool
+from cleargs.types import ArrayF64, ImageF32
 
 BLOCK = 64
 """Side of the blocks that are compared, px."""
@@ -23,9 +23,6 @@ ALIGNED_EVERY, COLOUR_EVERY = 32, 16
 """Distance between the starts of neighbouring blocks, px, in the checks of places and of colours."""
 REACH = 8
 """Longest shift that is searched along each axis, px."""
-
-REFUSED = "repair refused: "
-"""Prefix of the reason of a choice if the repair was refused as a candidate."""
 
 _FLAT = 0.02  # a block of lower standard deviation has too little texture to be aligned
 _AT_REST = 0.8  # see `_lengths`
@@ -58,13 +55,6 @@ def rejection_reason(
     discoloured = float((colour_differences(repair, observed, render) > limits.max_colour).mean())
     if discoloured > limits.max_share:
         return f"{discoloured:.0%} of its blocks off colour"
-    return None
-
-
-def all_masked(mask: MaskBool | None) -> str | None:
-    """Return the reason to refuse every candidate of a frame if all of its ``mask`` is False, else None."""
-    if mask is not None and not mask.any():
-        return "every pixel of the frame is masked"
     return None
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pydantic import Field
+from pydantic import AliasChoices, Field
 
 from cleargs.base_model import FrozenModel
 
@@ -19,8 +19,9 @@ class HarmConfig(FrozenModel):
     480x270), and no margin can separate harm from that.
     """
 
-    held_back: float = Field(
+    control: float = Field(
         0.125,
+        validation_alias=AliasChoices("control", "held_back"),
         ge=0.0,
         le=1.0,
         description="control frames: this share of the reliable frames (at least one) gets no repair and "
@@ -45,11 +46,11 @@ class HarmCheck:
 
     frames: list[int]
     """The control frames. Without any, every scene is published."""
-    psnr_before: float | None
-    psnr_after: float | None
-    score_before: float | None
-    score_after: float | None
-    harm: str | None
+    psnr_before: float | None = None
+    psnr_after: float | None = None
+    score_before: float | None = None
+    score_after: float | None = None
+    harm: str | None = None
     """The figure that fell by more than its margin; None if the distilled scene is published."""
 
 
@@ -62,7 +63,7 @@ def harm_of(
     bend the scene away from its best observations nor soften it.
     """
     if before is None or after is None:
-        return HarmCheck([], None, None, None, None, harm=None)
+        return HarmCheck([])
     worse = []
     if after.psnr < before.psnr - limits.psnr_margin:
         worse.append(f"PSNR fell by {before.psnr - after.psnr:.2f} dB")

@@ -1,7 +1,7 @@
 """The frames that image formation and RVA leave in need of a repair.
 
-Every run makes candidates, so that the decisions about them can be inspected: if few frames are in need, the
-next ones in the order are added.
+At least a sixteenth of the frames (and two) are tried, even if none needs a repair: every run has
+decisions to inspect.
 """
 
 from __future__ import annotations

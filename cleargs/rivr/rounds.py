@@ -1,16 +1,16 @@
 """One round of RIVR: restore every target frame, score its candidates, choose one, store them in an EXR.
 
-The EXR holds the candidates and, as attributes, the frame's row of the selection table. It is written
+The EXR holds the candidates and, as an attribute, the frame's row of the selection table. It is written
 atomically, so an interrupted round resumes at the first frame without an EXR.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,62 +22,51 @@ from cleargs.models.expert import Expert
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import (
-    CANDIDATES,
-    EXPLAINED,
-    KEPT,
-    CandidateChoice,
+    OBSERVED,
+    Materials,
     Source,
-    choose,
-    fuse,
+    candidate,
+    decide,
     hide_masked,
     is_negligible_change,
-    unbeaten,
 )
-from cleargs.rivr.distillation import Deblurred, TrainedScene, observation
-from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
+from cleargs.rivr.config import RepairConfig
+from cleargs.rivr.gates import rejection_reason
 from cleargs.rivr.tables import Selection, chosen_counts
+from cleargs.scene.viewer import Deblurred, SceneViewer, observation
 from cleargs.splat.views import TrainingView
 from cleargs.types import ImageF32, MaskBool
 
-PREFIX = "cleargs:"
-"""Prefix of the names of the attributes in the EXR."""
-
-_OPTIONAL = ("primary_fused", "primary_observed", "tiebreak_fused", "tiebreak_observed", "blur_px", "skew_px")
-"""Attributes that an EXR lacks if the row has no such value."""
+ROW = "cleargs:row"
+"""Attribute of the EXR with the frame's row of the selection table, as JSON."""
 
 TRUSTED = 0.5
 """Minimum weight of a frame that image formation explains and that supervises without a repair."""
 
 
 @dataclass(frozen=True)
-class Rules:
-    """Rules for restoring a frame, making its candidates and choosing one of them, from the settings."""
+class RepairContext:
+    """Settings, expert and scorers of the repairs."""
 
+    config: RepairConfig
     expert: Expert
     primary: Scorer
     tiebreak: Scorer
     cache: Path
     """Folder for the restorations of raw frames, each of which is made when it is first needed."""
     threads: int
-    use_observation: bool
-    undo_motion: bool
-    use_fused: bool
-    keep_raw: bool
-    fuse_sigma: float
-    margin: float
-    gate: GateConfig
 
     def restored(
-        self, view: TrainingView, render: ImageF32, scene: TrainedScene
+        self, view: TrainingView, render: ImageF32, scene: SceneViewer
     ) -> tuple[ImageF32, Source, Deblurred | None]:
         """Restore a frame, after undoing the motion that ``scene`` has found in it. ``render`` is its R_t.
 
         Returns:
-            D_t, the kind of image that it was made from, and the deblurred frame if it was made from that.
+            The restored image, its source, and the deblurred frame (None if the source is another).
         """
-        if not self.use_observation:
+        if not self.config.use_observation:
             return self._restored(render), "render", None
-        deblurred = scene.deblur(view) if self.undo_motion else None
+        deblurred = scene.deblur(view) if self.config.undo_motion else None
         if deblurred is None:
             return self._restored_observation(view), "observation", None
         return self._restored(deblurred.image), "deblurred", deblurred
@@ -100,8 +89,8 @@ class Rules:
 def run_round(
     number: int,
     targets: Sequence[TrainingView],
-    scene: TrainedScene,
-    rules: Rules,
+    scene: SceneViewer,
+    context: RepairContext,
     out: Path,
     reporter: Reporter,
     label: str,
@@ -121,16 +110,16 @@ def run_round(
             if row is None or (row.round, row.frame_id) != (number, view.frame_id):
                 if (out / exr).exists():
                     reporter.warn(f"{exr}: what an earlier run left cannot be used and is replaced")
-                row, image = repair(number, view, exr, scene, rules)
+                row, image = repair(number, view, exr, scene, context)
                 write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
-            kept = chosen_counts(rows)["observed"]
+            kept = chosen_counts(rows)[OBSERVED]
             task.update(done=len(rows), note=f"{kept} kept as filmed, {len(rows) - kept} repaired")
     return rows
 
 
 def repair(
-    number: int, view: TrainingView, exr: str, scene: TrainedScene, rules: Rules
+    number: int, view: TrainingView, exr: str, scene: SceneViewer, context: RepairContext
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
@@ -138,68 +127,50 @@ def repair(
     the images that were scored.
     """
     rendered = scene.render(view)
-    restored, source, deblurred = rules.restored(view, rendered, scene)
+    restored, source, deblurred = context.restored(view, rendered, scene)
     explained = scene.explained(view)
     observed, mask = observation(view)
     mask = scene.still(view, mask)  # regions that move are not repaired
     layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
-    if rules.use_fused:
-        fused = fuse(from_layer(layers["render"]), from_layer(layers["restored"]), rules.fuse_sigma)
-        layers["fused"] = to_layer(fused)
-    shown = {
-        name: hide_masked(from_layer(layers[name]), observed, mask) for name in CANDIDATES if name in layers
-    }
+    config, threads = context.config, context.threads
+    stored = (from_layer(layers["render"]), from_layer(layers["restored"]))
+    materials = Materials(*stored, observed, config.fuse_sigma)
+    layers |= {name: to_layer(candidate(name).make(materials)) for name in config.candidates}
+    shown = {name: hide_masked(from_layer(layer), observed, mask) for name, layer in layers.items()}
+    judged = shown | ({OBSERVED: observed} if config.keep_raw else {})
     primary, tiebreak = (
-        {name: _score(scorer, image, rules.threads) for name, image in shown.items()}
-        for scorer in (rules.primary, rules.tiebreak)
+        {name: _score(scorer, image, threads) for name, image in judged.items()}
+        for scorer in (context.primary, context.tiebreak)
     )
-    raw: list[float] = []
-    kept: str | None = None
-    if rules.keep_raw:
-        raw = [_score(scorer, observed, rules.threads) for scorer in (rules.primary, rules.tiebreak)]
-        if explained is not None and explained.weight >= TRUSTED:
-            kept = f"{EXPLAINED}{described(explained.formation)}"
-        elif (
-            view.weight > 0.0  # a frame of weight 0 supervises only by its repair
-            and unbeaten(raw[0], primary, rules.margin)
-            and unbeaten(raw[1], tiebreak, rules.margin)
-            and is_negligible_change(observed, shown["restored"], shown["render"])
-        ):
-            kept = KEPT
-    refused = rejection_reason(shown["restored"], observed, shown["render"], rules.gate)
-    choice = (
-        choose(primary, tiebreak, rules.margin)
-        if refused is None
-        else CandidateChoice("render", f"{REFUSED}{refused}")  # the fusion contains the refused repair
+    decision = decide(
+        primary,
+        tiebreak,
+        config.margin,
+        masked=mask is not None and not mask.any(),
+        explained=described(explained.formation) if explained and explained.weight >= TRUSTED else None,
+        # A frame of weight 0 supervises only by its repair.
+        negligible=view.weight > 0.0 and is_negligible_change(observed, shown["restored"], shown["render"]),
+        refused=rejection_reason(shown["restored"], observed, shown["render"], config.gate),
     )
-    masked = all_masked(mask)
     row = Selection(
         round=number,
         frame_id=view.frame_id,
         exr=exr,
-        primary_metric=rules.primary.name,
-        primary_render=primary["render"],
-        primary_restored=primary["restored"],
-        primary_fused=primary.get("fused"),
-        primary_observed=raw[0] if raw else None,
-        tiebreak_metric=rules.tiebreak.name,
-        tiebreak_render=tiebreak["render"],
-        tiebreak_restored=tiebreak["restored"],
-        tiebreak_fused=tiebreak.get("fused"),
-        tiebreak_observed=raw[1] if raw else None,
+        primary_metric=context.primary.name,
+        primary=primary,
+        tiebreak_metric=context.tiebreak.name,
+        tiebreak=tiebreak,
         restored_from=source,
         blur_px=None if deblurred is None else float(np.float32(deblurred.formation.blur_px)),
         skew_px=None if deblurred is None else float(np.float32(deblurred.formation.skew_px)),
-        chosen="observed" if kept else choice.chosen,
-        accepted=masked is None and kept is None,
-        reason=masked or kept or choice.reason,
+        **asdict(decision),
     )
-    layers["observed"] = to_layer(observed)
+    layers[OBSERVED] = to_layer(observed)
     if deblurred is not None:
         layers["deblurred"] = to_layer(deblurred.image)
     if explained is not None:
         layers["explained"] = to_layer(explained.image)
-    return row, LayeredImage(layers, _attributes(row))
+    return row, LayeredImage(layers, {ROW: json.dumps(asdict(row))})
 
 
 def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
@@ -217,20 +188,9 @@ def read_row(out: Path, exr: str) -> Selection | None:
     if not (out / exr).exists():
         return None
     try:
-        attributes: dict[str, Any] = dict(read_exr(out / exr, PREFIX).attributes)
-        values = {name.removeprefix(PREFIX): value for name, value in attributes.items()}
-        frame_id, accepted = values.pop("frame"), bool(values.pop("accepted"))
-        absent: dict[str, Any] = dict.fromkeys(_OPTIONAL)
-        return Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(absent | values))
-    except (StoreError, KeyError, TypeError):
+        return Selection(**json.loads(str(read_exr(out / exr, ROW).attributes[ROW])))
+    except (StoreError, KeyError, TypeError, ValueError):
         return None
-
-
-def _attributes(row: Selection) -> dict[str, int | float | str]:
-    values = {name: value for name, value in asdict(row).items() if name != "exr" and value is not None}
-    values["frame"] = values.pop("frame_id")
-    values["accepted"] = int(row.accepted)
-    return {f"{PREFIX}{name}": value for name, value in values.items()}
 
 
 def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView:

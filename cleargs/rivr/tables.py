@@ -15,13 +15,11 @@ from cleargs.capture.folders import is_inside
 from cleargs.errors import StoreError
 from cleargs.media.exr import Layer, read_exr
 from cleargs.parquet import read_table, schema_of, write_table
-from cleargs.rivr.candidates import CANDIDATES, Chosen, Source
-from cleargs.rivr.gates import REFUSED
+from cleargs.rivr.candidates import CANDIDATES, OBSERVED, REFUSED, Scores, Source
 
 _NAME = "name of the scorer that decides"
-_SCORE = "score, 0-100, higher is better, of"
-_FUSED = "the fusion F_t; null without it"
-_OBSERVED = "the raw frame O_t; null with rivr.keep_raw=false"
+_SCORES = "candidate, or observed (the raw frame, if it may be kept) -> score, 0-100, by the scorer"
+SCORES = pa.map_(pa.string(), pa.float32())
 
 
 @dataclass(frozen=True)
@@ -32,29 +30,21 @@ class Selection:
     frame_id: Annotated[int, "target frame t"]
     exr: Annotated[
         str | None,
-        "layers render, restored, fused, observed, deblurred, explained; below the rivr folder; null where "
+        "layers: the candidates, observed, deblurred, explained; below the rivr folder; null where "
         "the frame was not tried",
     ]
     primary_metric: Annotated[str | None, _NAME]
-    primary_render: Annotated[float | None, pa.float32(), f"primary {_SCORE} the render R_t"]
-    primary_restored: Annotated[float | None, pa.float32(), f"primary {_SCORE} the restored observation D_t"]
-    primary_fused: Annotated[float | None, pa.float32(), f"primary {_SCORE} {_FUSED}"]
-    primary_observed: Annotated[float | None, pa.float32(), f"primary {_SCORE} {_OBSERVED}"]
+    primary: Annotated[Scores, SCORES, f"{_SCORES} that decides"]
     tiebreak_metric: Annotated[
         str | None, f"{_NAME} among the candidates within rivr.margin of the best primary score"
     ]
-    tiebreak_render: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} the render R_t"]
-    tiebreak_restored: Annotated[
-        float | None, pa.float32(), f"tiebreak {_SCORE} the restored observation D_t"
-    ]
-    tiebreak_fused: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_FUSED}"]
-    tiebreak_observed: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_OBSERVED}"]
+    tiebreak: Annotated[Scores, SCORES, f"{_SCORES} that decides near-ties"]
     restored_from: Annotated[
         Source | None, "image that the expert restored to D_t: observation, deblurred or render"
     ]
     blur_px: Annotated[float | None, pa.float32(), "mean way of the pixels while exposed, as undone"]
     skew_px: Annotated[float | None, pa.float32(), "their mean way from the first to the last row"]
-    chosen: Annotated[Chosen, "render, restored or fused; observed: the raw frame needs no repair"]
+    chosen: Annotated[str, "a candidate; observed: the raw frame needs no repair"]
     accepted: Annotated[bool, "true if the chosen candidate became a pseudo observation"]
     reason: Annotated[str, "reason of the choice, or of the lack of a pseudo observation"]
 
@@ -72,8 +62,8 @@ class Selection:
     @classmethod
     def not_tried(cls, frame_id: int, reason: str) -> Selection:
         """Return the row of a frame that is kept as filmed and for which no candidate was made."""
-        row: dict[str, Any] = dict.fromkeys(SELECTION.names)
-        row |= {"round": 1, "frame_id": frame_id, "chosen": "observed", "accepted": False, "reason": reason}
+        row: dict[str, Any] = dict.fromkeys(SELECTION.names) | {"round": 1, "frame_id": frame_id}
+        row |= {"primary": {}, "tiebreak": {}, "chosen": OBSERVED, "accepted": False, "reason": reason}
         return cls(**row)
 
 
@@ -84,11 +74,8 @@ class Repair:
     frame_id: Annotated[int, "frame with an accepted repair"]
     round: Annotated[int, "its latest accepted round, from 1"]
     exr: Annotated[str, "layered EXR, relative to the rivr folder"]
-    chosen: Annotated[Chosen, "layer that supervises: render, restored or fused"]
+    chosen: Annotated[str, "layer that supervises: a candidate"]
 
-
-CHOICES: tuple[Chosen, ...] = (*CANDIDATES, "observed")
-"""Values of ``chosen`` in a row."""
 
 SELECTION, REPAIRS = schema_of(Selection), schema_of(Repair)
 
@@ -100,7 +87,7 @@ def write_selection(path: Path, rows: list[Selection]) -> None:
 
 def read_selection(path: Path) -> list[Selection]:
     """Read the rows in their order. Raise StoreError if the table is missing or damaged."""
-    return [Selection(**row) for row in read_table(path, SELECTION).to_pylist()]
+    return [Selection(**row) for row in read_table(path, SELECTION).to_pylist(maps_as_pydicts="strict")]
 
 
 def latest_accepted(rows: Sequence[Selection]) -> list[Selection]:
@@ -116,7 +103,7 @@ def kept_raw(rows: Sequence[Selection]) -> set[int]:
     The latest scene is the best reference, so this revokes an earlier repair, as a later repair does.
     """
     latest = {row.frame_id: row for row in sorted(rows, key=lambda row: row.round)}
-    return {frame_id for frame_id, row in latest.items() if row.chosen == "observed"}
+    return {frame_id for frame_id, row in latest.items() if row.chosen == OBSERVED}
 
 
 def repaired_share(rows: Sequence[Selection]) -> float:
@@ -135,12 +122,12 @@ def round_figures(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
     """Return the figures of round ``number`` for the manifest."""
     rows = [row for row in rows if row.round == number]
     tried = [row for row in rows if row.exr is not None]
-    refused = [row for row in rows if not row.accepted and row.chosen != "observed"]
+    refused = [row for row in rows if not row.accepted and row.chosen != OBSERVED]
     means = {
-        f"{role}_{name}": fmean(scores)
+        f"{role}_{name}": fmean(scores[name] for scores in found if name in scores)
         for role in ("primary", "tiebreak")
-        for name in CHOICES
-        if (scores := [score for row in rows if (score := getattr(row, f"{role}_{name}")) is not None])
+        if (found := [getattr(row, role) for row in tried])
+        for name in dict.fromkeys(name for scores in found for name in scores)
     }
     return {
         "round": number,
@@ -160,6 +147,7 @@ def refused_repairs(rows: Sequence[Selection]) -> int:
     return sum(row.reason.startswith(REFUSED) for row in rows)
 
 
-def chosen_counts(rows: Sequence[Selection]) -> dict[Chosen, int]:
-    """Return the number of rows per choice."""
-    return {name: sum(row.chosen == name for row in rows) for name in CHOICES}
+def chosen_counts(rows: Sequence[Selection]) -> dict[str, int]:
+    """Return the number of rows per choice, which is 0 for those of `CANDIDATES` that no row has."""
+    names = [*CANDIDATES, *(row.chosen for row in rows if row.chosen != OBSERVED), OBSERVED]
+    return {name: sum(row.chosen == name for row in rows) for name in names}

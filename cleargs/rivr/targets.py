@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from cleargs.capture.tables import load_frames
 from cleargs.errors import StageError
-from cleargs.formation.frames import view_of
 from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES
+from cleargs.scene.views import view_of
 from cleargs.splat.views import TrainingView
 
 

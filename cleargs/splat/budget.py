@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.splat.config import TrainConfig
+from cleargs.splat.densifier import load_densifier
 
 if TYPE_CHECKING:
     from cleargs.splat.views import TrainingView
@@ -24,16 +25,9 @@ Settings = TypeVar("Settings", bound=TrainConfig)
 
 
 def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
-    """Return the number of Gaussians at each step, [length], with maximum growth from ``start``."""
-    first, planned = config.first, config.planned
-    counts = np.full(config.length, float(start))
-    if not config.densify or config.budget is None or start >= config.budget:
-        return counts
-    refined = np.arange(config.refine_interval, first + config.length, config.refine_interval)
-    between = (refined >= config.refine_start * planned) & (refined <= config.refine_stop * planned)
-    for step in refined[between & (refined > first)] - first:
-        counts[step:] = min(config.budget, int((1.0 + config.growth) * counts[step]))
-    return counts
+    """Return the expected number of Gaussians at each step, [length], from ``start``."""
+    densifier = load_densifier(config)
+    return np.full(config.length, float(start)) if densifier is None else densifier.expected_counts(start)
 
 
 def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: int) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field, field_validator, model_validator
 
 from cleargs.base_model import FrozenModel, Unit
+from cleargs.plugins import require_known
 
 # Steps and Gaussians if the settings leave them unset (docs/experiments/training.md): steps follow the number
 # of frames, Gaussians the number of pixels. `quality` scales both; docs/speed.md lists its cost and gain.
@@ -19,6 +20,9 @@ STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.
 PIXELS_PER_GAUSSIAN = 30
 MIN_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
+
+MCMC_NAME, OFF = "mcmc", "off"
+"""Values of ``densify`` that need no other package."""
 
 INIT_SCALE = 0.5
 """Initial scale of a Gaussian, relative to the distance of its neighbours (docs/experiments/training.md)."""
@@ -55,6 +59,10 @@ class FormationConfig(FrozenModel):
     )
     every: int = Field(
         10, ge=1, description="training steps on a frame between two estimates of its image formation"
+    )
+    first_search: bool = Field(
+        True,
+        description="search every frame for blur once; false: only frames in which a short test finds blur",
     )
     pose: Literal["auto", "on", "off"] = Field(
         "auto",
@@ -95,7 +103,8 @@ class TrainConfig(FrozenModel):
         "standard",
         description="size of all trainings if steps and budget are unset: draft has a quarter of the steps "
         "of standard and half of its maximum number of Gaussians; high has 4 times the steps and twice the "
-        "Gaussians. A draft also has no more than 60 frames of 640 px, ends with G0 and makes no repairs",
+        "Gaussians. A draft also follows the recipe draft: at most 60 frames of 640 px, and no repairs",
+        json_schema_extra={"recipes": ["draft"]},
     )
     steps: int | None = Field(
         None,
@@ -122,7 +131,12 @@ class TrainConfig(FrozenModel):
         0.25, ge=0, le=1, description="fraction of the schedule, at its start, with reduced images; 0 = off"
     )
 
-    densify: bool = Field(True, description="split, move and add Gaussians during the training")
+    densify: str = Field(
+        MCMC_NAME,
+        description="strategy that splits, moves and adds Gaussians during the training: mcmc, off, or one "
+        "of another package",
+        json_schema_extra={"plugin": "densifiers"},
+    )
     budget: int | None = Field(
         None,
         ge=1,
@@ -238,6 +252,13 @@ class TrainConfig(FrozenModel):
     def refine_interval(self) -> int:
         """Steps between refinements."""
         return max(1, round(self.refine_every * self.planned))
+
+    @field_validator("densify", mode="before")
+    @classmethod
+    def _densify_is_known(cls, name: object) -> object:
+        if isinstance(name, bool):  # in older recipes
+            return MCMC_NAME if name else OFF
+        return require_known("densifiers", name, (MCMC_NAME, OFF)) if isinstance(name, str) else name
 
     @model_validator(mode="after")
     def _ends_after_its_begin(self) -> TrainConfig:

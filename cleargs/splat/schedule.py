@@ -1,4 +1,4 @@
-"""The schedule of a training: rates, image size, SH degree and refinements at each step."""
+"""The schedule of a training: rates, image size and SH degree at each step."""
 
 from __future__ import annotations
 
@@ -20,10 +20,6 @@ INRIA_STEPS = 30_000
 """Number of steps for which the rates of 3DGS were chosen."""
 MAX_RATE_FACTOR = 6.0
 """Upper limit of `rate_factor` (docs/training.md)."""
-
-ERROR_STEPS = 5
-"""Number of steps before a refinement that measure its errors, one frame each. Each costs a backward pass, so
-at most an eighth of the steps between refinements measure errors."""
 
 TEXTURE_FROM, TEXTURE_EVERY = 0.7, 3
 """Share of the schedule from which the term of texture is in the loss of every third step. Earlier,
@@ -97,17 +93,3 @@ class Schedule:
     def sees_texture(self, step: int) -> bool:
         """Return True if the next step has the term of texture in its loss."""
         return step >= TEXTURE_FROM * self._config.planned and step % TEXTURE_EVERY == 0
-
-    def refines(self, step: int) -> bool:
-        """Return True if a refinement is due after ``step`` steps."""
-        return step % self._config.refine_interval == 0 and self._refined(step)
-
-    def wants_errors(self, step: int) -> bool:
-        """Return True if the next step measures errors for the next refinement."""
-        interval = self._config.refine_interval
-        refined = -(-(step + 1) // interval) * interval
-        return refined - (step + 1) < min(ERROR_STEPS, max(1, interval // 8)) and self._refined(refined)
-
-    def _refined(self, step: int) -> bool:
-        config = self._config
-        return config.refine_start * config.planned <= step <= config.refine_stop * config.planned

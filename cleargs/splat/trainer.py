@@ -31,6 +31,7 @@ from cleargs.splat.budget import resolve_config, seconds_by_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.densification import relative_error
+from cleargs.splat.densifier import Densifier, DensifierState, load_densifier
 from cleargs.splat.formation import Formation, Formed, recorded
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.interruption import deferred_sigterm
@@ -109,7 +110,8 @@ class Trainer:
         self._moments = Moments.zeros(self._gaussians) if moments is None else moments.to(self._device)
         self._earlier_steps = 0 if moments is None else config.first
         self._schedule = Schedule(config, self._gaussians.sh.shape[1], self._device)
-        self._errors: Tensor | None = None  # [N] since the last refinement
+        self._densifier = load_densifier(config)
+        self._errors: Tensor | None = None  # [N], see `DensifierState`
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
         self._losses = LossAccumulator(self._device, config.ssim_lambda)
@@ -231,7 +233,7 @@ class Trainer:
             hidden = None if mask is None else mask[crop]
             gradient[crop] += share * self._texture.gradient(image[crop], target[crop], hidden)
         gradient.masked_fill_(too_bright, 0.0)
-        if config.densify and self._schedule.wants_errors(schedule_step):
+        if self._densifier is not None and self._densifier.wants_errors(schedule_step):
             errors = self._error_per_gaussian(image, target, mask, weight, formed)
             self._errors = errors if self._errors is None else self._errors + errors
         gradients = self._rasteriser.backward(gradient if formed is None else formed.backward(gradient))
@@ -248,8 +250,8 @@ class Trainer:
         if formed is not None:  # last, because it may wait for the device
             formed.learn()
         self.done += 1
-        if config.densify:
-            self._densify()
+        if self._densifier is not None:
+            self._densify(self._densifier)
 
     def preview(self) -> Tensor:
         """Return a small render [H, W, 3] sRGB of the view with the largest weight. The next replaces it."""
@@ -368,30 +370,19 @@ class Trainer:
                 self.check_finite()
                 raise self._error_at_step("the loss is not finite")
 
-    def _densify(self) -> None:
-        """Refine the Gaussians if it is due and errors were measured, then add noise to the means."""
-        config, schedule_step = self._config, self._schedule_step
-        if self._schedule.refines(schedule_step):
-            self.check_finite()  # a refinement would relocate Gaussians with NaN opacity, and hide the fault
-            if self._errors is not None:
-                assert config.budget is not None  # resolved in __init__
-                self._gaussians, self._moments = self._backend.refine(
-                    self._gaussians,
-                    self._moments,
-                    errors=self._errors,
-                    rate=config.growth,
-                    budget=config.budget,
-                    min_opacity=config.min_opacity,
-                    seed=(*self._seed, Stream.REFINEMENT, schedule_step),
-                )
-                self._errors = None
-        if config.noise > 0.0:
-            self._backend.add_position_noise(
-                self._gaussians,
-                amount=config.noise * self._schedule.rate_of_means(schedule_step),
-                min_opacity=config.min_opacity,
-                seed=(*self._seed, Stream.POSITION_NOISE, schedule_step),
-            )
+    def _densify(self, densifier: Densifier) -> None:
+        """Let the strategy change the Gaussians after a step."""
+        state = DensifierState(
+            self._gaussians,
+            self._moments,
+            self._errors,
+            self._schedule_step,
+            self._seed,
+            self._schedule.rate_of_means(self._schedule_step),
+            self.check_finite,
+        )
+        densifier.after_step(state)
+        self._gaussians, self._moments, self._errors = state.gaussians, state.moments, state.errors
 
     def _error_at_step(self, fault: str) -> StageError:
         return StageError(

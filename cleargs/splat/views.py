@@ -33,8 +33,8 @@ class TrainingView:
     kind: Literal["real", "pseudo"]
     """A raw frame (real), or its repair (pseudo)."""
     load: Callable[[], tuple[AnyImage, MaskBool | None]]
-    """Function that returns the image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and the mask [H, W] (True:
-    the pixel counts) or None. The cache calls it whenever it needs an image that it does not hold."""
+    """Function that loads the image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and the mask [H, W] (True:
+    the pixel counts) or None. It is called on each cache miss."""
     estimated: bool = False
     """True if the pose was estimated or adjusted; False if it is a pose of the input that fits the images."""
     time: float = math.nan

@@ -16,7 +16,7 @@ from toy import toy_dag
 
 from cleargs.cli.main import invoke
 from cleargs.manifest import read_manifest
-from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.stages import Stages
 
 SCENES = ("attic", "barn", "cellar")
 
@@ -28,7 +28,7 @@ class ToyBatch:
     root: Path
 
     @property
-    def dag(self) -> Dag:
+    def dag(self) -> Stages:
         return toy_dag(self.root / "journal")
 
     @property

@@ -29,9 +29,9 @@ from cleargs.errors import InputError
 from cleargs.evaluate import metrics
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.stages import installed
 from cleargs.pipeline.store import STORE_FOLDER
 from cleargs.progress import SilentReporter
 from cleargs.splat.config import budget_from_pixels

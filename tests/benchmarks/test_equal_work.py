@@ -14,7 +14,7 @@ from benchmarks.comparison.variants import VARIANTS, WHOLE, Variant
 from cleargs.errors import ConfigError
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)

@@ -22,8 +22,8 @@ from benchmarks.comparison.variants import QUESTIONS, VARIANTS, find_variants
 from cleargs.errors import ConfigError, InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.media.image import read_rgb
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.stages import installed
 from cleargs.progress import SilentReporter
 
 TINY = """

@@ -28,8 +28,8 @@ from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.media.image import read_rgb
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.stages import installed
 from cleargs.progress import SilentReporter
 from cleargs.synth.synthetic_capture import make_capture
 

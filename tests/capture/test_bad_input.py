@@ -16,7 +16,7 @@ from cleargs.capture.tables import load_points
 from cleargs.errors import CleargsError, ConfigError, InputError, StageError
 from cleargs.media.image import read_rgb
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 from cleargs.stages.ingest import IngestConfig
 
 from .conftest import HEIGHT, WIDTH, Ingest, camera_to_world, write_transforms

@@ -10,8 +10,8 @@ import pytest
 
 from cleargs.capture.cutouts import are_cut_outs, resampled
 from cleargs.capture.tables import load_frames
-from cleargs.formation.frames import view_of
 from cleargs.media.image import reduced
+from cleargs.scene.views import view_of
 
 from .conftest import HEIGHT, WIDTH, Ingest
 

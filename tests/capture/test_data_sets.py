@@ -226,7 +226,7 @@ def test_llff_capture_is_ingested(tmp_path: Path, frames: Frames, ingest: Ingest
     np.save(source / "poses_bounds.npy", poses_bounds([pose for pose, _ in frames]))
     done = ingest(source, holdout="every:4")
     summary = done.result.summary
-    assert summary["kind"] == "llff" and summary["poses"] == "input"
+    assert summary["kind"] == "llff" and summary["poses"] == "given"
     # True poses triangulate to well below a pixel; wrong axes would leave almost no points.
     assert summary["registered"] == 10 and summary["points"] > 200
     assert summary["mean_reprojection_error_px"] < 1

@@ -12,10 +12,10 @@ from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
 from cleargs.media.image import image_size
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate
+from cleargs.pipeline.stages import installed
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 

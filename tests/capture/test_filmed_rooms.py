@@ -11,7 +11,7 @@ import pytest
 from benchmarks.motion import compare
 from cleargs.cli.main import invoke
 from cleargs.manifest import read_manifest
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 
 
 def filmed(folder: Path, protocol: str) -> Path:

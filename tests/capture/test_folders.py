@@ -90,7 +90,7 @@ def test_poses_of_apps_are_those_planted(tmp_path: Path, frames: Frames, app: st
 def test_apps_are_ingested_with_their_poses(tmp_path: Path, frames: Frames, ingest: Ingest, app: str) -> None:
     done = ingest(write(READ[app][0], tmp_path / "capture", frames))
     assert done.result.summary["registered"] == 10 and READ[app][2] in done.result.summary["input"]
-    assert done.result.summary["poses"] in ("input", "refined")
+    assert done.result.summary["poses"] in ("given", "adjusted")
     assert done.result.summary["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.03)
 
 

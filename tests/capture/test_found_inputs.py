@@ -155,7 +155,7 @@ def test_models_without_tracks_are_triangulated(project: Path, ingest: Ingest, f
         (folder / "points3D.ply").write_bytes(b"ply\n")
     done = ingest(project)
     assert done.result.summary["registered"] == 10 and done.result.summary["points"] > 100
-    assert done.result.summary["poses"] == "input"
+    assert done.result.summary["poses"] == "given"
     assert any("no two images see" in line for line in done.warnings) == (what == "no tracks")
 
 

@@ -59,7 +59,7 @@ def test_given_poses_give_true_points(posed: Path, ingest: Ingest) -> None:
     done = ingest(posed)
     frames, points = load_frames(done.out), load_points(done.out)
     summary = done.result.summary
-    assert summary["poses"] == "input" and summary["registered"] == len(frames) == 10
+    assert summary["poses"] == "given" and summary["registered"] == len(frames) == 10
     assert summary["given_poses_missed_px"] < 0.5
     centres = np.stack([pose_of(frame).centre for frame in frames])
     assert np.allclose(centres.mean(axis=0), 0, atol=1e-12)
@@ -144,7 +144,7 @@ def shaken(posed: Path) -> Path:
 
 def test_poses_that_the_images_contradict_are_adjusted(shaken: Path, ingest: Ingest) -> None:
     kept, adjusted = ingest(shaken, "kept", refine_above=100), ingest(shaken, "adjusted")
-    assert kept.result.summary["poses"] == "input" and adjusted.result.summary["poses"] == "refined"
+    assert kept.result.summary["poses"] == "given" and adjusted.result.summary["poses"] == "adjusted"
     assert (
         kept.result.summary["given_poses_missed_px"] == adjusted.result.summary["given_poses_missed_px"] > 1
     )
@@ -167,14 +167,14 @@ def test_what_a_rolling_shutter_does_is_not_put_down_to_the_poses(posed: Path, i
         cv2.imwrite(str(path), cv2.remap(cv2.imread(str(path)), columns + swing, rows, cv2.INTER_LINEAR))
     done = ingest(posed)
     assert done.result.summary["given_poses_missed_px"] > 0.6
-    assert done.result.summary["poses"] == "input" and errors_of_poses(done.out) < (1e-6, 1e-9)
+    assert done.result.summary["poses"] == "given" and errors_of_poses(done.out) < (1e-6, 1e-9)
 
 
 def test_a_frame_without_features_keeps_its_pose_amid_an_adjustment(shaken: Path, ingest: Ingest) -> None:
     grey = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     cv2.imwrite(str(sorted((shaken / "images").iterdir())[4]), grey)
     kept, adjusted = ingest(shaken, "kept", refine_above=100), ingest(shaken, "adjusted")
-    assert adjusted.result.summary["poses"] == "refined"
+    assert adjusted.result.summary["poses"] == "adjusted"
     (one, two) = (load_frames(done.out)[4] for done in (kept, adjusted))
     assert two.registered and two.n_points == 0
     assert np.allclose(pose_of(one).rotation, pose_of(two).rotation, atol=1e-12)
@@ -204,7 +204,7 @@ def test_poses_that_are_far_off_are_found_again(posed: Path, ingest: Ingest) -> 
 def test_a_sparse_model_of_bad_poses_is_adjusted_too(shaken: Path, ingest: Ingest) -> None:
     first = ingest(shaken, "first", refine_above=100)
     second = ingest(first.out, "second")
-    assert second.result.summary["kind"] == "colmap" and second.result.summary["poses"] == "refined"
+    assert second.result.summary["kind"] == "colmap" and second.result.summary["poses"] == "adjusted"
     assert errors_of_poses(second.out)[0] < 0.1
 
 
@@ -223,17 +223,17 @@ def test_errors_that_a_sparse_model_states_are_not_believed(posed: Path, ingest:
     kept, adjusted = ingest(first.out, "kept"), ingest(first.out, "adjusted", refine_above=0.3)
     assert [done.result.summary["kind"] for done in (kept, adjusted)] == ["colmap", "colmap"]
     # 0.6 px is less than what other points miss at this camera. They replace those of the input.
-    assert kept.result.summary["poses"] == "input"
+    assert kept.result.summary["poses"] == "given"
     published = read_model(kept.out / "colmap/sparse/0")
     assert np.median(published.misses()) < 0.6 and np.median(published.error) > np.median(model.error)
-    assert adjusted.result.summary["poses"] in ("refined", "sfm")
+    assert adjusted.result.summary["poses"] in ("adjusted", "sfm")
     assert all(abs(frame.fx / FOCAL - 1) < 0.02 for frame in load_frames(adjusted.out))
 
 
 def test_a_sparse_model_keeps_its_points_where_other_poses_are_no_better(posed: Path, ingest: Ingest) -> None:
     first = ingest(posed, "first")
     second = ingest(first.out, "second", refine_above=0, max_features=512)  # would triangulate fewer points
-    assert second.result.summary["poses"] == "input"
+    assert second.result.summary["poses"] == "given"
     one, two = load_points(first.out), load_points(second.out)
     assert np.array_equal(one.point_id, two.point_id) and np.allclose(one.xyz, two.xyz, atol=1e-9)
 
@@ -435,7 +435,7 @@ def test_matrices_of_another_convention(posed: Path, ingest: Ingest, meant: obje
     # `write_transforms` changes the axes of each matrix to OpenGL's.
     write_transforms(posed, [meant(pose) @ OPENGL for pose in camera_to_world(10)])
     done = ingest(posed)
-    assert done.result.summary["poses"] == "input" and words in done.result.summary["pose_convention"]
+    assert done.result.summary["poses"] == "given" and words in done.result.summary["pose_convention"]
     assert any(words in text for text in done.warnings)
     assert errors_of_poses(done.out) < (1e-4, 1e-6)
     centres = np.stack([pose_of(frame).centre for frame in load_frames(done.out)])
@@ -447,7 +447,7 @@ def test_matrices_of_another_convention(posed: Path, ingest: Ingest, meant: obje
 def test_a_wrong_focal_length_is_adjusted(posed: Path, ingest: Ingest, focal: float) -> None:
     write_transforms(posed, camera_to_world(10), fl_x=focal, fl_y=focal)
     done = ingest(posed, refine_above=0.3)  # px, in images 320 px wide
-    assert done.result.summary["poses"] in ("refined", "sfm")
+    assert done.result.summary["poses"] in ("adjusted", "sfm")
     assert all(abs(frame.fx / FOCAL - 1) < 0.02 for frame in load_frames(done.out))
     assert errors_of_poses(done.out) < (0.3, 0.05)
 

@@ -23,9 +23,9 @@ from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import default_folder, usable_cores
+from cleargs.pipeline.stages import installed
 
 
 @pytest.fixture
@@ -345,7 +345,7 @@ def test_installed_stages_load_light() -> None:
     """Planning loads every stage module; a run with nothing to do must not pay for what `run` needs."""
     heavy = {"torch", "numba", "pycolmap", "cv2", "onnxruntime", "scipy"}
     program = (
-        "import sys; from cleargs.pipeline.dag import installed\n"
+        "import sys; from cleargs.pipeline.stages import installed\n"
         "from cleargs.pipeline.config import load_config\n"
         f"load_config(installed()); print(sorted({heavy!r} & set(sys.modules)))"
     )
@@ -421,18 +421,18 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path) -> None:
         )
         return StageOutcome(stage, how, manifest, tmp_path)
 
-    held_back = {"frames": [3, 9], "psnr_before": 22.58, "psnr_after": 23.61, "harm": None}
+    control = {"frames": [3, 9], "psnr_before": 22.58, "psnr_after": 23.61, "harm": None}
     outcomes = [
         outcome("ingest", "found", [], frames=24, registered=22, test=0),
         outcome("rva", "found", [], roles={"strong": 7}),
         outcome("g0", "made", ["scene.ply"], psnr_unseen=22.58, views=22),
-        outcome("rivr", "made", ["scene.ply", "selection.parquet"], held_back=held_back, psnr_unseen=23.4),
+        outcome("rivr", "made", ["scene.ply", "selection.parquet"], control=control, psnr_unseen=23.4),
         outcome(
             "consolidate",
             "made",
             ["scene.ply", "repairs.parquet"],
             repairs=11,
-            held_back=held_back,
+            control=control,
             psnr_unseen=23.61,
         ),
     ]

@@ -82,7 +82,7 @@ def test_names_keep_their_end() -> None:
 
 def test_figures_have_labels() -> None:
     summary = {
-        "held_back": {"frames": [1, 2], "psnr_before": 22.5, "harm": None},
+        "control": {"frames": [1, 2], "psnr_before": 22.5, "harm": None},
         "holdout_hash": "ab" * 32,
         "latest_rounds": {"2": 11},
         "rounds": [{"round": 1, "chosen": {"render": 3, "restored": 9, "fused": 0, "observed": 2}}],

@@ -23,10 +23,10 @@ from cleargs.manifest import FileRecord, KeyParts, Manifest, linked_manifest, pu
 from cleargs.media.image import to_uint8, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.pipeline.config import check_document
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec, read_run_file, write_run_file
+from cleargs.pipeline.stages import installed
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.splat.camera import Camera

@@ -49,6 +49,7 @@ CONFIG = TrainConfig(
     background=(0.0, 0.0, 0.0),  # the wall has gaps
 )
 LOOK = FormationConfig(start=0.0, every=4)
+DRAFT = LOOK.model_copy(update={"first_search": False})
 BLURRED = 2
 BLUR = FrameMotion(blur=np.array([0, 0, 0, 0, 7.0, 0]), median_depth=3.0)
 BENT = replace(BLUR, bend=np.array([0, 0, 0, 14.0, 0, 0]), pose=np.array([0, 0, 0, 14.0 / 12.0, 0, 0]))
@@ -231,7 +232,7 @@ def test_every_frame_is_searched_at_the_first_look(tmp_path: Path, searched: lis
 
 def test_a_draft_searches_only_frames_with_evidence(tmp_path: Path, searched: list[FramePair]) -> None:
     first = {k: FrameFormation(k, skew_gain=NO_TEST) for k in range(FRAMES)}
-    formation = CaptureFormation(views(), LOOK, known=first, draft=True)
+    formation = CaptureFormation(views(), DRAFT, known=first)
     run(tmp_path, views(), formation)
     assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
     assert len(searched) == 1
@@ -274,7 +275,7 @@ def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
         noisy = view.load()[0] + rng.normal(0.0, 8.0, (HEIGHT, WIDTH, 3))
         pixels = np.clip(noisy, 0, 255).astype(np.uint8)
         seen.append(replace(view, load=lambda pixels=pixels: (pixels, None)))
-    formation = CaptureFormation(seen, LOOK, known=known(), draft=True)
+    formation = CaptureFormation(seen, DRAFT, known=known())
     run(tmp_path, seen, formation)
     assert formation.frames[0].misfit > MIN_MISFIT
     assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)

@@ -8,7 +8,7 @@ import pyarrow as pa
 import torch
 from helpers import splat_toy
 
-from cleargs.formation.dust import MAX_LOSS, without_dust
+from cleargs.scene.dust import MAX_LOSS, without_dust
 from cleargs.splat.backend import mean_psnr
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene

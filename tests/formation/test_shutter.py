@@ -10,9 +10,9 @@ import pytest
 
 from cleargs.capture.tables import Frame
 from cleargs.formation.frame import FrameFormation
-from cleargs.formation.frames import view_of
 from cleargs.formation.motion import FrameMotion, Model
 from cleargs.formation.shutter import MAX_TESTED_FRAMES, CameraSpeeds, frames_to_test, rolls, with_skew
+from cleargs.scene.views import view_of
 from cleargs.splat.camera import Camera, look_at
 from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64

@@ -24,10 +24,10 @@ from pack_run import unpack
 
 from cleargs.capture.tables import load_frames
 from cleargs.formation.exposure import read_exposure
-from cleargs.formation.frames import view_of
-from cleargs.formation.observed import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
+from cleargs.scene.measure import evaluate_views
+from cleargs.scene.views import view_of
 from cleargs.splat.ply import read_ply
 
 # `stages` is the package `cleargs.stages` as it is in the repository: nothing needs to be installed.

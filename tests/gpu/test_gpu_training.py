@@ -14,8 +14,8 @@ from helpers import splat_toy
 from cleargs.errors import StageError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure
-from cleargs.formation.observed import evaluate_views
 from cleargs.progress import SilentReporter
+from cleargs.scene.measure import evaluate_views
 from cleargs.splat import densification
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
@@ -160,7 +160,7 @@ def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_p
 
 def test_training_follows_the_cpu(toy, device, tmp_path, monkeypatch):
     """Without densification, which draws other random numbers, both back ends take the same steps."""
-    config = CONFIG.model_copy(update={"densify": False, "steps": 3})
+    config = CONFIG.model_copy(update={"densify": "off", "steps": 3})
     on_gpu = trained_on(device, toy, tmp_path / "gpu", config=config)
     from cleargs.splat.kernels.cuda import support
 

@@ -19,11 +19,11 @@ from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError, StageError
 from cleargs.gpu import NO_GPU, Check, SelfTest
 from cleargs.pipeline import session
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome
 from cleargs.pipeline.session import DeviceChoice, resolve_device, resolve_run
 from cleargs.pipeline.stage import StageContext, StageResult
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Store
 from cleargs.stages import gpu_fault
 
@@ -147,7 +147,7 @@ def breaking(bench: Bench, gpu: Callable[[SelfTest | None], None]) -> Bench:
     gpu(PASSED)
     stages = {name: bench.dag.load(name) for name in bench.dag.names}
     stages["square"] = Breaking(bench.journal)
-    return replace(bench, dag=Dag(bench.dag.names, stages.__getitem__, gpu_fault=gpu_fault))
+    return replace(bench, dag=Stages(bench.dag.names, stages.__getitem__, gpu_fault=gpu_fault))
 
 
 def run_on(

@@ -9,8 +9,8 @@ import pytest
 from cleargs import plugins
 from cleargs.models import onnx
 from cleargs.models.onnx import runtime_version
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import library_versions
+from cleargs.pipeline.stages import installed
 
 
 @pytest.fixture(autouse=True)

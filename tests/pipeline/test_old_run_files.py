@@ -10,10 +10,10 @@ from toy import Remarks
 
 from cleargs.errors import ConfigError
 from cleargs.pipeline.config import check_document, known_settings, load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.run_file import RUN_FILE, read_run_file
 from cleargs.pipeline.session import resolve_run
 from cleargs.pipeline.settings import settings_of
+from cleargs.pipeline.stages import installed
 
 OLD = (Path(__file__).with_name("old_run.toml")).read_text()
 """The recipe smoke as written by version 0.2.0: 190 settings, with those of a training in three tables."""
@@ -58,7 +58,7 @@ def test_later_trainings_follow_the_first() -> None:
     sections: Any = load_config(installed(), "default", ["g0.lr_sh=0.5", "g0.quality=draft"]).sections
     for stage in ("rivr", "consolidate"):
         training = sections[stage].distil.applied_to(sections["g0"], 100)
-        assert (training.lr_sh, training.quality, training.densify) == (0.5, "draft", False)
+        assert (training.lr_sh, training.quality, training.densify) == (0.5, "draft", "off")
 
 
 def test_settings_are_few() -> None:

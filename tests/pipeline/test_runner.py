@@ -18,10 +18,10 @@ from cleargs.errors import InputError, StageError, StoreError
 from cleargs.files import write_json
 from cleargs.manifest import MANIFEST, read_manifest, write_manifest
 from cleargs.parquet import column, table_meanings, write_table
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.runner import Runner, check_same_input
 from cleargs.pipeline.stage import Estimate
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Store
 
 
@@ -136,7 +136,7 @@ def test_new_version_of_a_stage_is_a_miss(bench: Bench) -> None:
     bench.work_done()
     stages = {name: bench.dag.load(name) for name in bench.dag.names}
     stages["square"] = replace(stages["square"], VERSION=2)  # type: ignore[type-var]  # a dataclass behind a protocol
-    newer = replace(bench, dag=Dag(bench.dag.names, stages.__getitem__))
+    newer = replace(bench, dag=Stages(bench.dag.names, stages.__getitem__))
     assert newer.plan()["square"].reasons == ("stage version: 1 -> 2",)
     newer.run()
     assert stages_run(bench) == ["square"], "total reads equal content"

@@ -19,16 +19,16 @@ from cleargs.pipeline.config import (
     read_toml,
     recipe_names,
 )
-from cleargs.pipeline.dag import Dag, installed, load_stage
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.run_file import RunSpec, read_run_file, write_run_file
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run
 from cleargs.pipeline.settings import settings_of
+from cleargs.pipeline.stages import Stages, installed, load_stage
 
 
 @pytest.fixture
-def dag(tmp_path: Path) -> Dag:
+def dag(tmp_path: Path) -> Stages:
     return toy_dag(tmp_path / "journal")
 
 
@@ -89,7 +89,7 @@ def test_merge_keeps_what_is_not_named() -> None:
         ("seed=true", "seed = True cannot be used", "a whole number from 0"),
     ],
 )
-def test_errors_teach(dag: Dag, text: str, cause: str, hint: str) -> None:
+def test_errors_teach(dag: Stages, text: str, cause: str, hint: str) -> None:
     with pytest.raises(ConfigError) as error:
         check_document(dag, parse_override(text))
     assert cause in str(error.value)
@@ -132,7 +132,7 @@ def test_run_file_has_the_meaning_of_each_setting(bench: Bench) -> None:
     assert read_run_file(bench.folder, installed()).config == document
 
 
-def test_recipe_file_then_overrides_then_seed(dag: Dag, tmp_path: Path) -> None:
+def test_recipe_file_then_overrides_then_seed(dag: Stages, tmp_path: Path) -> None:
     recipe = tmp_path / "mine.toml"
     recipe.write_text("seed = 3\n[square]\npower = 3\n[count]\nlimit = 7\n")
     config = load_config(dag, str(recipe), ["square.power=4"])
@@ -142,7 +142,7 @@ def test_recipe_file_then_overrides_then_seed(dag: Dag, tmp_path: Path) -> None:
     assert load_config(dag, str(recipe), seed=9).seed == 9
 
 
-def test_bad_recipes(dag: Dag, tmp_path: Path) -> None:
+def test_bad_recipes(dag: Stages, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no recipe 'defalt'") as error:
         read_recipe("defalt")
     assert error.value.hint == "did you mean default?"
@@ -176,7 +176,7 @@ def test_run_file_gives_back_the_run(bench: Bench) -> None:
     assert read_run_file(bench.folder, bench.dag) == elsewhere
 
 
-def test_marked_settings_stay_out_of_the_key(dag: Dag) -> None:
+def test_marked_settings_stay_out_of_the_key(dag: Stages) -> None:
     config = check_document(dag, {"count": {"weights": "/somewhere"}}).sections["count"]
     assert key_config(config) == {"limit": 100, "mode": "plain", "inner": {"depth": 3}}
 

@@ -19,11 +19,11 @@ from cleargs.digest import DigestMemo
 from cleargs.errors import StageError
 from cleargs.files import write_bytes
 from cleargs.pipeline.config import check_document, merge, parse_override
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.runner import Runner, StageOutcome
 from cleargs.pipeline.stage import Estimate, Stage, StageContext, StageResult
+from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 
@@ -193,9 +193,9 @@ def note(journal: Path, line: str) -> None:
         file.write(line + "\n")
 
 
-def toy_dag(journal: Path) -> Dag:
+def toy_dag(journal: Path) -> Stages:
     stages: dict[str, Stage] = {"count": Count(journal), "square": Square(journal), "total": Total(journal)}
-    return Dag(tuple(stages), stages.__getitem__)
+    return Stages(tuple(stages), stages.__getitem__)
 
 
 class Remarks(SilentReporter):
@@ -217,7 +217,7 @@ class Bench:
     """A toy run. Each call opens the store again, as a new process would."""
 
     root: Path
-    dag: Dag
+    dag: Stages
     remarks: Remarks
 
     @property

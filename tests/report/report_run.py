@@ -18,10 +18,10 @@ from cleargs.media.exr import LayeredImage, to_layer, write_exr
 from cleargs.media.image import write_rgb
 from cleargs.parquet import write_table
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec, write_run_file
+from cleargs.pipeline.stages import installed
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
@@ -94,7 +94,7 @@ class FinishedRun:
         self._trained("g0", g0)
         self._rivr()
         held = {"frames": [0], "harm": None, "psnr_before": 24.0, "psnr_after": 25.5}
-        consolidated = {"repairs": 5, "published": "consolidated scene", "held_back": held}
+        consolidated = {"repairs": 5, "published": "consolidated scene", "control": held}
         self._trained("consolidate", consolidated | {"psnr_unseen": 24.6})
 
     def planner(self, store: Store) -> Planner:
@@ -240,15 +240,9 @@ class FinishedRun:
                     frame_id=index,
                     exr=exr,
                     primary_metric="sharp-1",
-                    primary_render=80.0,
-                    primary_restored=85.0 + index,
-                    primary_fused=None,
-                    primary_observed=75.0,
+                    primary={"render": 80.0, "restored": 85.0 + index, "observed": 75.0},
                     tiebreak_metric="natural-1",
-                    tiebreak_render=70.0,
-                    tiebreak_restored=71.0,
-                    tiebreak_fused=None,
-                    tiebreak_observed=72.0,
+                    tiebreak={"render": 70.0, "restored": 71.0, "observed": 72.0},
                     restored_from="observation",
                     blur_px=2.0 * index,
                     skew_px=0.3,

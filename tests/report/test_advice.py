@@ -17,9 +17,9 @@ from report_run import FinishedRun
 from cleargs.cli.main import invoke
 from cleargs.digest import DigestMemo
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import RunSpec, write_run_file
+from cleargs.pipeline.stages import installed
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.report.advice import Advice, shown_advice

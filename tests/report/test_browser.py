@@ -18,11 +18,11 @@ from report_run import COUNT, HOSTILE, FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.digest import DigestMemo
-from cleargs.formation.frames import camera_of
 from cleargs.named_views import keep_views
 from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
 from cleargs.report.single_file import write_single_file
+from cleargs.scene.views import camera_of
 from cleargs.splat.render import Viewer, render
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]

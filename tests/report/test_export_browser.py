@@ -16,8 +16,8 @@ from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
-from cleargs.formation.frames import camera_of
 from cleargs.report.web_scene import viewer_pose, write_viewer
+from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.render import Viewer
 

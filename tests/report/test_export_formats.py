@@ -18,10 +18,10 @@ from cleargs.capture.model import read_model
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
-from cleargs.formation.frames import camera_of
-from cleargs.formation.observed import Fit
 from cleargs.named_views import keep_views
 from cleargs.render import pruning
+from cleargs.scene.measure import ViewPsnr
+from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply, morton_order
 from cleargs.splat.formats import FORMATS
@@ -202,7 +202,7 @@ def test_a_frame_without_a_pixel_that_counts_is_not_in_the_psnr_of_pruning(
     run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     psnr = iter([math.inf, 30.0, 30.0, 30.0, 30.0, math.inf, 20.0, 20.0, 20.0, 20.0])
-    monkeypatch.setattr(pruning, "evaluate_views", lambda *views, **options: [Fit(next(psnr), None)])
+    monkeypatch.setattr(pruning, "evaluate_views", lambda *views, **options: [ViewPsnr(next(psnr), None)])
     assert export(run, tmp_path / "a.ply", "--prune", "opacity:0.1") == 0
     assert numbers(capsys, PRUNED)[1:] == [30.0, 20.0]
 

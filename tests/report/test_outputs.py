@@ -17,9 +17,9 @@ from cleargs.cli.main import invoke
 from cleargs.digest import file_digest
 from cleargs.errors import InputError
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.run_file import write_run_file
+from cleargs.pipeline.stages import installed
 
 COMMANDS: dict[str, tuple[str, Callable[[Path], list[str]]]] = {
     "export": ("ply", lambda file: ["export", "RUN", "-o", str(file), "--force"]),

@@ -16,7 +16,7 @@ from tiny_capture import Capture, Contrast, Sharpen, tiny_rivr, tried_rows, writ
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import read_exr
 from cleargs.progress import SilentReporter
-from cleargs.rivr.gates import GateConfig, all_masked, colour_differences, rejection_reason, shifts
+from cleargs.rivr.gates import GateConfig, colour_differences, rejection_reason, shifts
 from cleargs.rivr.rounds import read_row
 from cleargs.stages import rivr
 from cleargs.types import ImageF32
@@ -180,11 +180,3 @@ def test_refused_repairs_stay_on_disk_and_the_render_is_taken(
     assert [text.partition(":")[0] for text in warnings] == [
         f"{len(rows)} of {len(rows)} repairs by sharpen were refused"
     ]
-
-
-def test_a_wholly_masked_frame_is_refused() -> None:
-    mask = np.zeros((4, 5), bool)
-    assert all_masked(mask) is not None
-    mask[2, 2] = True
-    assert all_masked(mask) is None
-    assert all_masked(None) is None

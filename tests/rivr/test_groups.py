@@ -104,13 +104,13 @@ def test_steps_of_groups_without_a_repair_go_to_the_next(capture: Capture) -> No
 def test_every_frame_is_a_target_and_nothing_is_judged(capture: Capture) -> None:
     """The paper's way: no frame is held out, no veto even of a wrecked scene."""
     wrecking = tiny_g0(lr_scales=3.0)
-    config = tiny_rivr(rounds=1, group=4, harm={"held_back": 0.0, "psnr_margin": 0.0, "score_margin": 0.0})
+    config = tiny_rivr(rounds=1, group=4, harm={"control": 0.0, "psnr_margin": 0.0, "score_margin": 0.0})
     context = capture.context("rivr", config, g0=wrecking)
     result = rivr.run(context)
     rows = tried_rows(context)
     assert [row.frame_id for row in rows] == list(range(len(ROLES)))
-    assert result.summary["held_back"]["frames"] == []
-    assert result.summary["held_back"]["psnr_after"] is None
+    assert result.summary["control"]["frames"] == []
+    assert result.summary["control"]["psnr_after"] is None
     assert result.summary["published"] == "distilled scene"
     assert not (context.out / "rejected.ply").exists()
     after = capture.context("consolidate", tiny_consolidate(), g0=wrecking, rivr=config)
@@ -151,9 +151,9 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
         ("cleargs.rivr.rounds.write_exr", 4),  # at the start of the third
         ("cleargs.splat.trainer.Trainer.step", 4),  # inside the second group's distillation
         ("cleargs.splat.trainer.Trainer.step", 11),  # inside the third's, after its checkpoint
-        ("cleargs.rivr.distillation.write_ply", 1),  # at the end of the second's, before its last file
-        ("cleargs.rivr.distillation.drop_state", 3),  # between two groups of round 2
-        ("cleargs.rivr.distillation._copy", 1),  # while publishing
+        ("cleargs.splat.ply.write_ply", 1),  # at the end of the second's, before its last file
+        ("cleargs.scene.folder.SceneFolder.drop_state", 3),  # between two groups of round 2
+        ("cleargs.scene.folder._copy", 1),  # while publishing
     ],
 )
 def test_a_run_killed_among_its_groups_goes_on_to_the_same_files(

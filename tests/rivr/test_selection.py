@@ -3,26 +3,76 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cleargs.rivr.candidates import (
-    CANDIDATES,
-    CandidateName,
-    choose,
-    hide_masked,
-    is_negligible_change,
-    unbeaten,
-)
+from cleargs.rivr.candidates import Decision, Scores, decide, hide_masked, is_negligible_change
 
 three_scores = st.tuples(*[st.floats(0, 100)] * 3)
 
 
-def scores(render: float, restored: float, fused: float) -> dict[CandidateName, float]:
-    return {"render": render, "restored": restored, "fused": fused}
+def scores(render: float, restored: float, fused: float, **raw: float) -> dict[str, float]:
+    return {"render": render, "restored": restored, "fused": fused, **raw}
+
+
+def choose(primary: Scores, tiebreak: Scores, margin: float) -> Decision:
+    """The decision about a frame that may not be kept, with a repair that passes the gates."""
+    found = decide(primary, tiebreak, margin)
+    assert found.accepted
+    return found
+
+
+BETTER, WORSE, EQUAL = (scores(50, score, 40, observed=59.0) for score in (70, 30, 60))
+WITHOUT = scores(50, 70, 40)
+
+
+@pytest.mark.parametrize(
+    ("primary", "facts", "chosen", "accepted", "reason"),
+    [
+        (BETTER, {}, "restored", True, "primary score"),
+        (BETTER, {"refused": "out of place"}, "render", True, "repair refused: out of place"),
+        (BETTER, {"explained": "blur 3 px"}, "observed", False, "explained: blur 3 px"),
+        (
+            BETTER,
+            {"explained": "blur 3 px", "refused": "off colour"},
+            "observed",
+            False,
+            "explained: blur 3 px",
+        ),
+        (BETTER, {"negligible": True}, "restored", True, "primary score"),
+        (WORSE, {}, "render", True, "primary score"),
+        (WORSE, {"negligible": True}, "observed", False, "needs no repair"),
+        (EQUAL, {"negligible": True}, "observed", False, "needs no repair"),
+        (WORSE, {"negligible": True, "refused": "off colour"}, "observed", False, "needs no repair"),
+        (WITHOUT, {"negligible": True, "explained": "blur 3 px"}, "restored", True, "primary score"),
+        (BETTER, {"masked": True}, "restored", False, "every pixel of the frame is masked"),
+        (
+            BETTER,
+            {"masked": True, "refused": "off colour"},
+            "render",
+            False,
+            "every pixel of the frame is masked",
+        ),
+        (
+            BETTER,
+            {"masked": True, "explained": "blur"},
+            "observed",
+            False,
+            "every pixel of the frame is masked",
+        ),
+    ],
+)
+def test_decision(primary: Scores, facts: dict[str, Any], chosen: str, accepted: bool, reason: str) -> None:
+    assert decide(primary, primary, 1.0, **facts) == Decision(chosen, accepted, reason)
+
+
+def test_a_raw_frame_is_kept_only_if_both_scorers_agree() -> None:
+    assert decide(WORSE, BETTER, 1.0, negligible=True).chosen == "render"
+    assert decide(BETTER, WORSE, 1.0, negligible=True).chosen == "restored"
 
 
 def test_primary_decides_beyond_the_margin() -> None:
@@ -53,8 +103,9 @@ def test_without_margin_only_exact_ties_are_broken() -> None:
 
 
 def test_two_candidates_suffice() -> None:
-    primary: dict[CandidateName, float] = {"render": 40, "restored": 70}
-    assert choose(primary, {"render": 9, "restored": 1}, margin=1.0).chosen == "restored"
+    assert (
+        choose({"render": 40, "restored": 70}, {"render": 9, "restored": 1}, margin=1.0).chosen == "restored"
+    )
 
 
 @given(primary=three_scores, tiebreak=three_scores, margin=st.floats(0, 100))
@@ -64,17 +115,12 @@ def test_the_choice_is_never_further_than_the_margin(
     p, t = scores(*primary), scores(*tiebreak)
     chosen = choose(p, t, margin).chosen
     assert max(primary) - p[chosen] <= margin
-    assert all(t[name] <= t[chosen] for name in CANDIDATES if max(primary) - p[name] <= margin)
+    assert all(t[name] <= t[chosen] for name in p if max(primary) - p[name] <= margin)
 
 
 def test_scores_must_be_finite() -> None:
     with pytest.raises(ValueError, match="finite"):
         choose(scores(1, math.nan, 2), scores(1, 2, 3), margin=1.0)
-
-
-def test_a_raw_frame_is_unbeaten_up_to_the_margin() -> None:
-    assert unbeaten(59.0, scores(50, 60, 40), margin=1.0)
-    assert not unbeaten(58.9, scores(50, 60, 40), margin=1.0)
 
 
 def test_a_repair_that_changes_little_beside_what_is_unexplained() -> None:

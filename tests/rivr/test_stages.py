@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import pkgutil
 from collections.abc import Callable
 from pathlib import Path
@@ -34,12 +35,11 @@ from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.movement import write_movement
-from cleargs.formation.observed import Fit, evaluate_views
 from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.progress import SilentReporter
-from cleargs.rivr.candidates import fuse
-from cleargs.rivr.distillation import TrainedScene
+from cleargs.rivr import rounds
+from cleargs.rivr.candidates import decide, fuse
 from cleargs.rivr.tables import (
     REPAIRS,
     SELECTION,
@@ -51,6 +51,8 @@ from cleargs.rivr.tables import (
     write_selection,
 )
 from cleargs.rivr.targets import load_supervision
+from cleargs.scene.measure import ViewPsnr, evaluate_views
+from cleargs.scene.viewer import SceneViewer
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import TrainingView
@@ -116,12 +118,11 @@ def test_every_round_repairs_every_target(capture: Capture, expert: Sharpen) -> 
     assert {row.primary_metric for row in rows} == {"contrast"}
     for row in rows:
         exr = read_exr(context.out / row.exr, "cleargs:")
-        assert exr.attributes["cleargs:frame"] == row.frame_id
-        assert exr.attributes["cleargs:round"] == row.round
-        assert exr.attributes["cleargs:chosen"] == row.chosen
+        assert list(exr.attributes) == ["cleargs:row"]
+        assert Selection(**json.loads(exr.attributes["cleargs:row"])) == row
         plain = ImageBuf(str(context.out / row.exr)).get_pixels(HALF)[..., :3]
         np.testing.assert_array_equal(plain, exr.layers[row.chosen])  # the layer that ordinary programs show
-        assert exr.attributes["cleargs:primary_fused"] == row.primary_fused
+        assert row.primary.keys() == row.tiebreak.keys() == {"render", "restored", "fused"}
         images = {name: from_layer(layer) for name, layer in exr.layers.items()}
         fused = fuse(images["render"], images["restored"], 2.0)
         np.testing.assert_allclose(images["fused"], fused, atol=1 / 4096)  # half floats
@@ -134,7 +135,7 @@ def test_every_round_repairs_every_target(capture: Capture, expert: Sharpen) -> 
     # The held-back frame goes on supervising as it did for G0.
     assert {frame_id for frame_id, kind in drawn if kind == "real"} <= {0, 2, HELD_BACK, 4, 5, 6}
     summary = result.summary
-    assert summary["held_back"]["frames"] == [HELD_BACK]
+    assert summary["control"]["frames"] == [HELD_BACK]
     assert sum(summary["rounds"][0]["chosen"].values()) == len(TARGETS)
     assert summary["published"] == "distilled scene"
 
@@ -171,12 +172,10 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
     blur = dict.fromkeys(((n, k) for n in (1, 2) for k in TARGETS), 0.0)
     for row in rows:
         exr = read_exr(context.out / row.exr, "cleargs:")
-        assert row.restored_from == exr.attributes["cleargs:restored_from"]
         if row.restored_from == "observation":
             assert row.blur_px is None
             continue
         assert row.blur_px is not None
-        assert row.blur_px == exr.attributes["cleargs:blur_px"]
         blur[row.round, row.frame_id] = row.blur_px
         # The expert saw float32, the EXR holds halves: a few half steps of slack for the sharpening.
         deblurred = from_layer(exr.layers["deblurred"])
@@ -187,11 +186,11 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
 
 
 def test_without_fusion_there_are_two_candidates(capture: Capture) -> None:
-    context = capture.context("rivr", tiny_rivr(use_fused=False, rounds=1))
+    context = capture.context("rivr", tiny_rivr(candidates=(), rounds=1))
     rivr.run(context)
     rows = tried_rows(context)
     assert {row.chosen for row in rows} <= {"render", "restored"}
-    assert {(row.primary_fused, row.tiebreak_fused) for row in rows} == {(None, None)}
+    assert all(row.primary.keys() == row.tiebreak.keys() == {"render", "restored"} for row in rows)
     assert set(read_exr(context.out / rows[0].exr).layers) == {"render", "restored", "observed"}
 
 
@@ -212,7 +211,7 @@ def keeping(**changes: Any) -> Any:
     The stand-in scorers have no calibrated scale. The margin leaves the choice to them only where they differ
     much.
     """
-    return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, **changes)
+    return tiny_rivr(undo_motion=True, candidates=(), keep_raw=True, margin=20.0, **changes)
 
 
 PLAIN = tiny_g0(formation={"enabled": False}, background=(0.0, 0.0, 0.0))
@@ -259,8 +258,8 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
     view = supervision.views[2]
     formation = CaptureFormation([view], FormationConfig(), known={2: found})
     write_formation(capture.root / "g0" / "formation.parquet", formation, {2: view.weight})
-    scene = TrainedScene(capture.root / "g0")
-    monkeypatch.setattr("cleargs.rivr.distillation.fit_motion", None)
+    scene = SceneViewer(capture.root / "g0")
+    monkeypatch.setattr("cleargs.scene.viewer.fit_motion", None)
     undone = scene.deblur(view)
     assert undone is not None and undone.formation.blur_px == 6.0
     whole, half = scene.formed_layers(view), scene.formed_layers(view, 0.5)
@@ -275,15 +274,15 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
 def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[int] = []
 
-    def recorded(scene: Scene, views: list[TrainingView], *rest: Any, **options: Any) -> list[Fit]:
+    def recorded(scene: Scene, views: list[TrainingView], *rest: Any, **options: Any) -> list[ViewPsnr]:
         compared.extend(view.frame_id for view in views)
         return evaluate_views(scene, views, *rest, **options)
 
-    monkeypatch.setattr("cleargs.rivr.distillation.MAX_EVALUATED", 3)
-    monkeypatch.setattr("cleargs.rivr.distillation.evaluate_views", recorded)
+    monkeypatch.setattr("cleargs.scene.viewer.MAX_EVALUATED", 3)
+    monkeypatch.setattr("cleargs.scene.viewer.evaluate_views", recorded)
     supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
     views = [view for _, view in sorted(supervision.views.items())][:7]
-    assert TrainedScene(capture.root / "g0").psnr_unseen(views) is not None
+    assert SceneViewer(capture.root / "g0").psnr_unseen(views) is not None
     assert compared == [views[0].frame_id, views[3].frame_id, views[6].frame_id]
 
 
@@ -300,7 +299,7 @@ def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest
     for row in rows:
         assert row.accepted == ((row.round, row.frame_id) not in kept)
         assert (row.reason == "needs no repair") == (row.chosen == "observed")
-        assert row.primary_observed is not None and row.tiebreak_observed is not None
+        assert "observed" in row.primary and "observed" in row.tiebreak
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     drawn = set(zip(log["frame_id"], log["kind"], strict=True))
     assert not {(k, "pseudo") for k in sharp} & drawn
@@ -324,7 +323,7 @@ def test_where_every_frame_is_kept_the_scene_trains_on_raw_frames(capture: Captu
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     assert len(log["kind"]) == 12 and set(log["kind"]) == {"real"}
     assert (summary["repairs"], summary["chosen"]["observed"]) == (0, len(TARGETS))
-    assert summary["held_back"]["frames"] == []  # no repair can have done harm
+    assert summary["control"]["frames"] == []  # no repair can have done harm
 
 
 def test_the_latest_round_decides_whether_a_frame_is_repaired(capture: Capture) -> None:
@@ -350,7 +349,7 @@ def test_the_papers_rule_scores_no_raw_frame(capture: Capture) -> None:
     context = capture.context("rivr", tiny_rivr(rounds=1))
     rivr.run(context)
     rows = tried_rows(context)
-    assert {(row.primary_observed, row.tiebreak_observed) for row in rows} == {(None, None)}
+    assert not any("observed" in row.primary or "observed" in row.tiebreak for row in rows)
     assert "observed" not in {row.chosen for row in rows}
     assert all(row.accepted for row in rows)
 
@@ -371,14 +370,14 @@ def test_masked_pixels_and_what_moves_do_not_reach_the_scores(
             return restored
 
         monkeypatch.setattr(expert, "restore", ruin)
-        context = capture.context("rivr", tiny_rivr(rounds=1, use_fused=False), run=run)
+        context = capture.context("rivr", tiny_rivr(rounds=1, candidates=()), run=run)
         rivr.run(context)
         rows = tried_rows(context)
         return next(row for row in rows if row.frame_id == frame)
 
     untouched, masked, seen = scores("a", slice(0, 0)), scores("b", slice(0, 20)), scores("c", slice(20, 40))
-    assert masked.primary_restored == untouched.primary_restored
-    assert seen.primary_restored != untouched.primary_restored
+    assert masked.primary["restored"] == untouched.primary["restored"]
+    assert seen.primary["restored"] != untouched.primary["restored"]
 
 
 @pytest.mark.parametrize("stage", ["rivr", "consolidate"])
@@ -395,7 +394,7 @@ def test_harm_keeps_the_better_scene(capture: Capture, stage: str) -> None:
         result = consolidate.run(context)
     assert same_scene(context.out, better)
     assert (context.out / "rejected.ply").read_bytes() != (context.out / "scene.ply").read_bytes()
-    checked = result.summary["held_back"]
+    checked = result.summary["control"]
     assert "PSNR fell" in checked["harm"]
     assert checked["psnr_after"] < checked["psnr_before"] - 0.5
 
@@ -422,15 +421,16 @@ def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> Non
     assert result.summary["repairs"] == len(TARGETS) - 1
 
 
-def test_a_draft_publishes_the_first_scene_unchanged(capture: Capture) -> None:
-    draft = tiny_g0(quality="draft")
-    first = capture.context("rivr", tiny_rivr(), g0=draft)
+def test_without_rounds_the_first_scene_stays(capture: Capture) -> None:
+    first = capture.context("rivr", tiny_rivr(rounds=0))
     assert rivr.run(first).summary["published"] == "G0"
     rows = read_selection(first.out / "selection.parquet")
     assert [row.frame_id for row in rows] == list(range(len(ROLES)))
-    assert {(row.exr, row.chosen, row.reason) for row in rows} == {(None, "observed", "not tried: a draft")}
-    second = capture.context("consolidate", tiny_consolidate(), g0=draft)
-    assert consolidate.run(second).summary == {"repairs": 0, "published": "G0", "draft": True}
+    assert {(row.exr, row.chosen, row.reason) for row in rows} == {
+        (None, "observed", "not tried: no repairs are made")
+    }
+    second = capture.context("consolidate", tiny_consolidate(), rivr=tiny_rivr(rounds=0))
+    assert consolidate.run(second).summary == {"repairs": 0, "published": "G0"}
     for context, stage in ((first, rivr), (second, consolidate)):
         assert same_scene(context.out, capture.root / "g0")
         assert set(stage.OUTPUTS) <= {path.name for path in context.out.iterdir()}
@@ -442,14 +442,14 @@ def test_a_round_in_which_nothing_is_taken_ends_the_rounds(
     """Its training takes the steps of the rounds that are left, on the raw frames."""
     lines: list[str] = []
     monkeypatch.setattr(SilentReporter, "info", lambda reporter, text: lines.append(text))
-    monkeypatch.setattr("cleargs.rivr.rounds.all_masked", lambda mask: "every pixel of the frame is masked")
+    monkeypatch.setattr(rounds, "decide", lambda *args, **facts: decide(*args, **facts | {"masked": True}))
     context = capture.context("rivr", tiny_rivr(rounds=3, targets="auto"))
     result = rivr.run(context)
     assert [made["round"] for made in result.summary["rounds"]] == [1]
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     assert len(log["frame_id"]) == 3 * 12 and set(log["kind"]) == {"real"}
     assert any("no candidate is taken" in line for line in lines)
-    assert result.summary["held_back"]["frames"] == []  # no repair can have done harm
+    assert result.summary["control"]["frames"] == []  # no repair can have done harm
 
 
 def test_consolidation_without_repairs_is_g0_byte_for_byte(capture: Capture) -> None:
@@ -511,8 +511,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
         ("cleargs.splat.trainer.Trainer.step", 12),  # after it, before its files
         ("cleargs.splat.trainer.Trainer.step", 20),  # inside the distillation of round 2
         ("cleargs.splat.trainer.Trainer.step", 30),  # inside the consolidation
-        ("cleargs.rivr.distillation.write_ply", 1),  # the last file of round 2
-        ("cleargs.rivr.distillation._copy", 1),  # while publishing
+        ("cleargs.splat.ply.write_ply", 1),  # the last file of round 2
+        ("cleargs.scene.folder._copy", 1),  # while publishing
     ],
 )
 def test_a_killed_run_goes_on_to_the_same_files(

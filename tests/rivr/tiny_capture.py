@@ -140,7 +140,7 @@ def tiny_rivr(**changes: Any) -> RivrConfig:
         "rounds": 2,
         "targets": "all",
         "undo_motion": False,
-        "use_fused": True,
+        "candidates": ("fused",),
         "keep_raw": False,
         "distil": {"steps": 12},
         "harm": {"psnr_margin": 100, "score_margin": 100},

@@ -22,8 +22,8 @@ from pydantic import BaseModel, ConfigDict
 
 from cleargs.capture import tables as ingest
 from cleargs.parquet import write_table
-from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stages import Stages
 from cleargs.rva.tables import B_CUES, CUE_COLUMNS, R_CUES
 
 KEY = "sk-Loopback+Secret/7491"
@@ -219,7 +219,7 @@ class PreparedIngest:
         return StageResult()
 
 
-def two_stages() -> Dag:
+def two_stages() -> Stages:
     """The real RVA stage after `PreparedIngest`."""
     stages: dict[str, Any] = {"ingest": PreparedIngest(), "rva": import_module("cleargs.stages.rva")}
-    return Dag(tuple(stages), stages.__getitem__)
+    return Stages(tuple(stages), stages.__getitem__)

@@ -9,7 +9,7 @@ from helpers.splat_toy import gaussians, images, start, views
 
 from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.stages import installed
 from cleargs.splat.budget import gaussians_by_step, resolve_config, training_cost
 from cleargs.splat.config import Quality, TrainConfig, budget_from_pixels, steps_from_frames
 from cleargs.splat.trainer import Trainer

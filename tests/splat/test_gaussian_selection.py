@@ -7,8 +7,8 @@ import pytest
 import torch
 from test_export import make_scene
 
-from cleargs.formation.dust import contributions
 from cleargs.render.pruning import central_box, inside
+from cleargs.scene.dust import contributions
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render

@@ -12,7 +12,7 @@ from helpers.splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians
 from benchmarks.speed import reference
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
-from cleargs.formation.frames import view_of
+from cleargs.scene.views import view_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import binning, projection

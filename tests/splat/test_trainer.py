@@ -19,9 +19,10 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.observed import Fit, evaluate_views, pooled_unseen, render_observed
+from cleargs.formation.observed import render_observed
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
+from cleargs.scene.measure import ViewPsnr, evaluate_views, pooled_unseen
 from cleargs.splat import trainer as trainer_module
 from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
@@ -131,7 +132,7 @@ def test_saturated_pixels_do_not_darken_the_scene(pictures: list[np.ndarray], tm
     )
     still = CONFIG.model_copy(
         update={
-            "densify": False,
+            "densify": "off",
             "noise": 0.0,
             "opacity_reg": 0.0,
             "scale_reg": 0.0,
@@ -462,7 +463,7 @@ def test_unseen_pixels_measure_quality_without_training(pictures: list[np.ndarra
     assert pooled_unseen(seen) == pytest.approx(
         -10 * np.log10(np.mean([0.1 ** (fit.unseen / 10) for fit in seen]))
     )
-    assert pooled_unseen([Fit(20.0, None)]) is None
+    assert pooled_unseen([ViewPsnr(20.0, None)]) is None
 
 
 def test_one_percent_of_each_frame_is_unseen() -> None:
@@ -494,7 +495,7 @@ def test_pseudo_views_get_their_share_and_weight(pictures: list[np.ndarray], tmp
 
 
 def test_without_densification_the_number_stays(pictures: list[np.ndarray], tmp_path: Path) -> None:
-    trained = run(pictures, tmp_path, CONFIG.model_copy(update={"densify": False}))
+    trained = run(pictures, tmp_path, CONFIG.model_copy(update={"densify": "off"}))
     assert trained.scene.gaussians.num == 60
 
 
@@ -626,7 +627,7 @@ def test_a_scene_that_is_not_finite_is_refused(pictures: list[np.ndarray], tmp_p
 def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: Path) -> None:
     darker = [*pictures[:3], *((picture * 0.8).astype(np.uint8) for picture in pictures[3:])]
     weights = [1.0, 0.9, 0.8, 0.9, 0.5, 0.12]
-    config = CONFIG.model_copy(update={"steps": 300, "densify": False, "lr_sh": 1e-3})
+    config = CONFIG.model_copy(update={"steps": 300, "densify": "off", "lr_sh": 1e-3})
     formation = affines(weights, rate=3e-3)
     trained = run(
         views(darker, weights=weights), tmp_path, config, scene=Scene(gaussians()), formation=formation

@@ -9,8 +9,8 @@ from typing import Any, cast
 
 import pytest
 
-from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.stage import Stage
+from cleargs.pipeline.stages import Stages, installed
 from tools.versions import (
     Sources,
     current_lock,
@@ -74,7 +74,7 @@ class PackageTree:
     def lock(self) -> dict[str, dict[str, Any]]:
         sources = Sources({"cleargs": self.root / "cleargs", "cleargs.stages": self.root / "stages"})
         stage = cast(Stage, SimpleNamespace(VERSION=self.version))
-        return current_lock(Dag(("one",), lambda name: stage), sources)
+        return current_lock(Stages(("one",), lambda name: stage), sources)
 
 
 @pytest.fixture

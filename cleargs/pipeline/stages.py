@@ -13,7 +13,7 @@ from cleargs.progress import Say
 
 
 @dataclass(frozen=True)
-class Dag:
+class Stages:
     """The stages, in an order in which each comes after the stages that it reads."""
 
     names: tuple[str, ...]
@@ -41,10 +41,10 @@ class Dag:
         return self.names if name is None else self.names[: self.names.index(self.check(name)) + 1]
 
 
-def installed() -> Dag:
+def installed() -> Stages:
     """Return the stages of the package ``cleargs.stages``. A module is imported when it is first used."""
     package = import_module("cleargs.stages")
-    return Dag(tuple(package.STAGES), load_stage, package.pace, package.gpu_fault)
+    return Stages(tuple(package.STAGES), load_stage, package.pace, package.gpu_fault)
 
 
 def load_stage(name: str) -> Stage:

@@ -12,7 +12,7 @@ from torch import Tensor
 from cleargs.capture.folders import spread
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
-from cleargs.formation.observed import MAX_EVALUATED, Fit, evaluate_views
+from cleargs.scene.measure import MAX_EVALUATED, ViewPsnr, evaluate_views
 from cleargs.splat.backend import mean_psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_C0
@@ -32,8 +32,10 @@ class Dusted(NamedTuple):
     """A training without dust, and how well its scene fits the views that were compared."""
 
     trained: Trained
+    dropped: int
+    """Number of Gaussians that were dust."""
     compared: list[TrainingView]
-    fits: list[Fit]
+    fits: list[ViewPsnr]
 
 
 def without_dust(
@@ -55,13 +57,14 @@ def without_dust(
     )
     psnr = [mean_psnr(fit.psnr for fit in fits) or 0.0 for fits in (before, after)]
     if not seen.any() or psnr[1] < psnr[0] - MAX_LOSS:
-        return Dusted(trained, few, before)
+        return Dusted(trained, 0, few, before)
     kept = seen.cpu()
     state = {
         name: tensor[kept] if name.startswith(("first.", "second.", "strategy.")) else tensor
         for name, tensor in trained.state.items()
     }
-    return Dusted(replace(trained, scene=smaller.to("cpu"), state=state), few, after)
+    smallest = replace(trained, scene=smaller.to("cpu"), state=state)
+    return Dusted(smallest, int((~seen).sum()), few, after)
 
 
 def contributions(scene: Scene, cameras: Iterable[Camera], advance: Callable[[], None]) -> Tensor:  # [N]

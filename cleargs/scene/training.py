@@ -1,0 +1,42 @@
+"""A training whose result is a scene folder: of G0, of a group of repairs, or of the consolidation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.exposure import Exposure
+from cleargs.progress import Reporter
+from cleargs.scene.dust import Dusted, without_dust
+from cleargs.scene.folder import SceneFolder
+from cleargs.splat.config import TrainConfig
+from cleargs.splat.scene import Scene
+from cleargs.splat.trainer import Trainer
+from cleargs.splat.views import TrainingView
+
+
+def train_into(
+    folder: Path,
+    scene: Scene,
+    views: Sequence[TrainingView],
+    config: TrainConfig,
+    formation: CaptureFormation,
+    *,
+    exposure: Exposure,  # that is written if exposure compensation is off
+    checkpoint: Path,
+    reporter: Reporter,
+    label: str,
+    device: str,
+    round: int = 0,
+    **options: Any,  # for `Trainer`
+) -> Dusted:
+    """Train a scene, remove its dust and write the files of `SceneFolder` into ``folder``."""
+    trainer = Trainer(scene, views, config, formation=formation, device=device, **options)
+    trained = trainer.run(checkpoint=checkpoint, reporter=reporter, label=label, round=round)
+    learned = formation.exposure or exposure
+    dusted = without_dust(trained, views, learned, formation.frames, formation.moving, device)
+    weights = {view.frame_id: view.weight for view in views if view.kind == "real"}
+    SceneFolder(folder).write(dusted.trained, learned, formation, weights)
+    return dusted
