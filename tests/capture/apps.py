@@ -81,7 +81,7 @@ def nerfcapture(root: Path, pictures: Pictures, poses: Poses) -> None:
 
 def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
     """Stray Scanner."""
-    root.mkdir(parents=True)
+    root.mkdir(parents=True, exist_ok=True)
     with av.open(root / "rgb.mp4", "w") as video:
         stream = video.add_stream("libx264", rate=10, options={"crf": "10", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"

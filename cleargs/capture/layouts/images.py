@@ -9,6 +9,7 @@ from cleargs.capture.capture import Capture, External
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import contents_of
 from cleargs.capture.folders import chosen
+from cleargs.capture.no_captures import kind_of
 from cleargs.errors import InputError
 
 _LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
@@ -28,9 +29,11 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     contents = contents_of(source, config)
     frames = contents.frames()
     if not frames:
+        files = ((file.name, kind_of(file)) for file in sorted(source.iterdir()) if file.is_file())
+        named = (f"{name} is {kind[0]}: {kind[1]}" for name, kind in files if kind is not None)
         raise InputError(
             f"{source} holds no images, no video and no transforms.json",
-            hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
+            hint=next(named, "give a video, a folder of images, a COLMAP project or transforms.json"),
         )
     patterns = [*(f"*/{name}" for name in _LISTS), "dense/*/sparse"] if config.uses_poses else []
     nested = [path for pattern in patterns for path in sorted(source.glob(pattern))]
