@@ -45,11 +45,12 @@ _PROCESSED = re.compile(
     r"correct|undist|rectif|edit|resiz|enhanc|normal|semantic|segment|label|instance|albedo|depth|dispar|flow",
     re.IGNORECASE,
 )
+_INFRARED = re.compile(r"(.*[\W\d_])?(infra(red)?|n?ir|thermal)([\W\d_].*)?", re.IGNORECASE)
 _EDITED = re.compile(r"IMG_E(\d+)|(.+)[-_ ]edited|(.+) \(\d+\)", re.IGNORECASE)
 """Names of second versions: edited on iPhones, by Google Photos, and downloaded twice."""
 _PREVIEW_NAME = re.compile(r"thumb|preview|poster|contact.?sheet", re.IGNORECASE)
 
-MASKS, DEPTH, GREY = "mask%s", "depth map%s", "picture%s of one channel"
+MASKS, DEPTH, GREY, INFRARED = "mask%s", "depth map%s", "picture%s of one channel", "infrared picture%s"
 ALONE = "mask%s without a photograph of the same name"
 VIDEOS, RAW, UNREADABLE = "video%s", "raw or other picture%s", "HEIC picture%s without pillow-heif"
 PREVIEWS, COPIES, OUTSIDE = (
@@ -164,7 +165,9 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
         images = _without(images, left_out[OUTSIDE])
     left_out[MASKS] = _masks(images, root)
     headers = {path: read_header(path) for path in _without(images, left_out[MASKS])}
-    images, left_out[DEPTH], left_out[GREY] = _by_channels(headers)
+    left_out[INFRARED] = _infrared(headers)
+    shown = {path: header for path, header in headers.items() if path not in set(left_out[INFRARED])}
+    images, left_out[DEPTH], left_out[GREY] = _by_channels(shown)
     left_out[PREVIEWS] = _previews(images, headers)
     images = _without(images, left_out[PREVIEWS])
     left_out[COPIES] = _copies(images, headers)
@@ -227,6 +230,13 @@ def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
         if folder is not None:
             found |= {names[name]: mask for name, mask in masks_of(folder, list(names)).items()}
     return found
+
+
+def _infrared(headers: Mapping[Path, Header | None]) -> list[Path]:
+    """Return the pictures named as infrared, in any format. If there are few in colour, none is left out."""
+    found = [path for path in headers if any(map(_INFRARED.fullmatch, (path.stem, path.parent.name)))]
+    colour = [path for path in _without(list(headers), found) if not _is_grey(headers[path])]
+    return found if len(colour) >= FEWEST else []
 
 
 def _is_grey(header: Header | None) -> bool:

@@ -10,7 +10,7 @@ from cleargs.capture.capture import Capture, External, Layout
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import media_files
 from cleargs.capture.layouts import colmap, images, llff, rgbd, transforms, video
-from cleargs.capture.no_captures import is_small_copy, kind_of, refused
+from cleargs.capture.other_files import is_small_copy, kind_of, refused
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.plugins import load_plugin

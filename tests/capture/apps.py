@@ -240,3 +240,28 @@ def edited_and_downloaded_twice(root: Path, pictures: Pictures, poses: Poses) ->
     save(root / "IMG_E0001.JPG", pictures[1][::-1])
     save(root / "IMG_0002-edited.JPG", pictures[2][::-1])
     save(root / "IMG_0003 (1).JPG", pictures[3])
+
+
+def realsense(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Intel RealSense's recorder: a folder per sensor. The second infrared sensor was saved in colour."""
+    for index, picture in enumerate(pictures):
+        save(root / f"color/{index:06d}.jpg", picture)
+        depth(root / f"depth/{index:06d}.png")
+        save(root / f"infrared/{index:06d}.png", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        save(root / f"infrared2/{index:06d}.png", picture)
+
+
+def realsense_viewer(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Snapshots of Intel's viewer: all sensors in one folder."""
+    for index, picture in enumerate(pictures):
+        save(root / f"room_Color_{index}.png", picture)
+        depth(root / f"room_Depth_{index}.png")
+        save(root / f"room_Infrared_{index}.png", picture)
+
+
+def azure_kinect(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Azure Kinect: infrared of 16 bits, smaller than the colour."""
+    for index, picture in enumerate(pictures):
+        save(root / f"color/{index:05d}.jpg", picture)
+        depth(root / f"depth/{index:05d}.png")
+        save(root / f"ir/{index:05d}.png", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.uint16) * 16)

@@ -249,7 +249,7 @@ def test_a_mask_of_one_pixel(posed: Path, ingest: Ingest) -> None:
         ingest(posed)
 
 
-# -- files that are no capture -----------------------------------------------------------------------------
+# -- files other than captures ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_a_mask_of_one_pixel(posed: Path, ingest: Ingest) -> None:
         ("scene.ply", None, "a 3D scene or model", "cleargs export, render and eval"),
     ],
 )
-def test_a_file_that_is_no_capture_is_named(
+def test_a_file_of_another_kind_is_named(
     tmp_path: Path, name: str, beside: str | None, kind: str, remedy: str
 ) -> None:
     cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((24, 32, 3), np.uint8))

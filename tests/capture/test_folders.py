@@ -49,6 +49,9 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "ScanNet++": (apps.scannetpp, 10, "and 10 masks (iphone/rgb_masks/); left out: 10 depth maps"),
     "maps": (apps.monocular_maps, 10, "10 photographs (rgb/); left out: 20 second pictures"),
     "edited": (apps.edited_and_downloaded_twice, 10, "left out: 3 second pictures"),
+    "RealSense": (apps.realsense, 10, "20 infrared pictures (infrared/ 10, infrared2/ 10), 10 depth maps"),
+    "RealSense Viewer": (apps.realsense_viewer, 10, "left out: 10 infrared pictures, 10 depth maps"),
+    "Azure Kinect": (apps.azure_kinect, 10, "left out: 10 infrared pictures (ir/), 10 depth maps (depth/)"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
@@ -61,7 +64,7 @@ def test_photographs_are_read_and_the_rest_is_told(tmp_path: Path, frames: Frame
         capture = open_capture(root, IngestConfig(poses=poses))
         assert len(capture.frames) == capture.n_available == count
         assert poses == "sfm" or told in capture.told
-        depths = ("depth", "conf", "thumb", "mask", "cover", "web")
+        depths = ("depth", "conf", "thumb", "mask", "cover", "web", "infra", "ir/")
         assert not any(word in frame.name for frame in capture.frames for word in depths)
         named = externals(root, IngestConfig(poses=poses)).values()
         files = {p for place in named for p in (place.values() if isinstance(place, dict) else [place])}
@@ -170,6 +173,12 @@ def test_photographs_of_a_thermal_camera_have_16_bits(images: Path) -> None:
     for path in images.iterdir():
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * 257)
     assert len(open_capture(images, IngestConfig()).frames) == 10
+
+
+def test_photographs_of_an_infrared_camera_alone_are_taken(images: Path) -> None:
+    images.rename(images.with_name("infrared"))
+    capture = open_capture(images.parent, IngestConfig())
+    assert (len(capture.frames), capture.told) == (10, "read: 10 photographs (infrared/)")
 
 
 def test_two_lenses_of_a_phone_stay(images: Path) -> None:

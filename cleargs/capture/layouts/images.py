@@ -9,7 +9,7 @@ from cleargs.capture.capture import Capture, External
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import contents_of
 from cleargs.capture.folders import chosen
-from cleargs.capture.no_captures import kind_of
+from cleargs.capture.other_files import kind_of
 from cleargs.errors import InputError
 
 _LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")

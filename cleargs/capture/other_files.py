@@ -1,4 +1,4 @@
-"""Files that are no capture: what they are by their endings, and what to give in their place."""
+"""Files other than captures: what they are by their endings, and what to give in their place."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def kind_of(path: Path) -> tuple[str, str] | None:
 
 
 def refused(path: Path, kind: str, hint: str) -> InputError:
-    """Return the error for a file that is no capture. Its hint names a video or the pictures beside it."""
+    """Return the error for such a file. Its hint names a video or the pictures in its folder."""
     beside = [file for file in sorted(path.parent.iterdir()) if file.suffix.lower() in _MEDIA]
     its = next((video for video in beside if _is_original(video, path)), None)
     if its is not None:
