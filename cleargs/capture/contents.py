@@ -21,6 +21,7 @@ from cleargs.capture.folders import (
     image_files,
     is_wanted,
     mask_externals,
+    masks_by_number,
     masks_of,
     natural_key,
     unmasked,
@@ -39,15 +40,25 @@ of their number, or if they have the numbers of others in their names."""
 
 _REDUCED = 0.75  # share of the long side up to which a folder with the names of another one has copies
 
-_SYSTEM = re.compile(r"[.@#]|__MACOSX$")  # start of the names of hidden folders and of those of network disks
+_SYSTEM = re.compile(r"[.@#]|(__MACOSX|MeshroomCache|odm_\w+|.+\.(files|cmvs))$")
+"""Names of hidden folders, of network disks' own, and of the work of Meshroom, ODM, Metashape, VisualSFM."""
+_RUNS = ("run.toml", "cfg_args")  # files in the results of ClearGS, and of the trainers that follow Inria's
 _MASK_FOLDER = re.compile(r"(.+[._-])?masks?", re.IGNORECASE)
 _PROCESSED = re.compile(
-    r"correct|undist|rectif|edit|resiz|enhanc|normal|semantic|segment|label|instance|albedo|depth|dispar|flow",
+    r"correct|undist|rectif|edit|resiz|enhanc|normal|semantic|segment|label|instance|albedo|depth|dispar|flow|export",
     re.IGNORECASE,
 )
-_INFRARED = re.compile(r"(.*[\W\d_])?(infra(red)?|n?ir|thermal)([\W\d_].*)?", re.IGNORECASE)
+_MAP = re.compile(
+    r"(.*[\W\d_])?(normals?|semantics?|seg|segmentation|labels?|instances?|albedo|depths?|disparity|flow)([\W\d_].*)?",
+    re.IGNORECASE,
+)
+_INFRARED = re.compile(r"(.*[\W\d_])?(infra(red)?|n?ir|thermal)([\W\d_].*)?|DJI_.+_T(HRM)?", re.IGNORECASE)
 _EDITED = re.compile(r"IMG_E(\d+)|(.+)[-_ ]edited|(.+) \(\d+\)", re.IGNORECASE)
 """Names of second versions: edited on iPhones, by Google Photos, and downloaded twice."""
+_PRODUCT = re.compile(
+    r"(.*[\W\d_])?(screen.?shot|texture|diffuse|map_kd|ortho(photo|mosaic)?|dsm|dem|pano(rama)?)([\W\d_].*)?",
+    re.IGNORECASE,
+)
 _PREVIEW_NAME = re.compile(r"thumb|preview|poster|contact.?sheet", re.IGNORECASE)
 
 MASKS, DEPTH, GREY, INFRARED = "mask%s", "depth map%s", "picture%s of one channel", "infrared picture%s"
@@ -58,6 +69,7 @@ PREVIEWS, COPIES, OUTSIDE = (
     "second picture%s, reduced or in another format",
     "picture%s outside images/",
 )
+PRODUCTS = "picture%s named as a texture, map, panorama or screenshot"
 PHOTOGRAPHS, UNWANTED = "photograph%s", "file%s by --only or --skip"
 _HINTS = {
     VIDEOS: "photographs are taken; for the videos, give one as the input, or set --skip for the photographs",
@@ -170,6 +182,9 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     images, left_out[DEPTH], left_out[GREY] = _by_channels(shown)
     left_out[PREVIEWS] = _previews(images, headers)
     images = _without(images, left_out[PREVIEWS])
+    products = [path for path in images if _PRODUCT.fullmatch(path.stem)]
+    left_out[PRODUCTS] = products if len(products) <= _FEW * (len(images) - len(products)) else []
+    images = _without(images, left_out[PRODUCTS])
     left_out[COPIES] = _copies(images, headers)
     images = _without(images, left_out[COPIES])
     only_maps = any(header and header.deep for header in headers.values())
@@ -191,7 +206,8 @@ def media_files(root: Path) -> list[Path]:
     """Return pictures and videos below ``root``, without hidden ones and those of runs."""
     suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
     found = files_under(
-        root, lambda folder: bool(_SYSTEM.match(folder.name)) or (folder / "run.toml").is_file()
+        root,
+        lambda folder: bool(_SYSTEM.match(folder.name)) or any((folder / name).is_file() for name in _RUNS),
     )
     files = (path for path in found.values() if path.suffix.lower() in suffixes and path.is_file())
     return sorted(files, key=lambda path: (path.parent, path.name))
@@ -228,7 +244,8 @@ def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
     found = {by_stem[unmasked(mask)]: mask for mask in masks if unmasked(mask) in by_stem}
     for folder in dict.fromkeys(_mask_folder(mask, contents.root) for mask in masks):
         if folder is not None:
-            found |= {names[name]: mask for name, mask in masks_of(folder, list(names)).items()}
+            of = masks_of(folder, list(names)) or masks_by_number(folder, list(names))
+            found |= {names[name]: mask for name, mask in of.items()}
     return found
 
 
@@ -283,6 +300,7 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
     stems: dict[Path, Path] = {}
     second = [path for path in images if stems.setdefault(path.with_suffix(""), path) is not path]
     second += [path for path in _without(images, second) if _is_second(path, stems)]
+    second += _maps(_without(images, second))
     folders: dict[Path, dict[str, Path]] = defaultdict(dict)
     for path in _without(images, second):
         folders[path.parent][path.stem.lower()] = path
@@ -302,6 +320,19 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
         else:
             kept.append(files)
     return second
+
+
+def _maps(images: Sequence[Path]) -> list[Path]:
+    """Return pictures named as normals, labels or depth that have the number of another picture."""
+    maps = [path for path in images if _MAP.fullmatch(path.stem)]
+    numbers = {_numbers(path) for path in _without(images, maps)} - {()}
+    return [
+        path for path in maps if any(_numbers(path)[: n + 1] in numbers for n in range(len(_numbers(path))))
+    ]
+
+
+def _numbers(path: Path) -> tuple[str, ...]:
+    return tuple(re.findall(r"\d+", path.stem))
 
 
 def _is_second(path: Path, stems: Mapping[Path, Path]) -> bool:

@@ -24,7 +24,11 @@ _KINDS = (
     ("a 3D scene or model", ".ply .splat .spz .sog .glb .gltf .obj .fbx .stl .usd .usdc .usdz", _SCENES),
     ("a laser scan", ".las .laz .e57 .pts .ptx", _GIVE),
     ("a recording of a camera", ".bag .db3 .mcap .svo .r3d .klg .sens", "export its pictures into a folder"),
-    ("a 360 degree video", ".insv .360", "export a flat video of it with the camera's program"),
+    (
+        "a recording of a 360 degree camera",
+        ".insv .insp .360",
+        "export a flat video of it with the camera's program",
+    ),
     ("a raw or other picture", " ".join(RAW_SUFFIXES), "convert it to JPEG or PNG, and give its folder"),
 )
 """Kind of file, its endings (lower case), and the remedy."""
@@ -38,6 +42,13 @@ _READABLE = frozenset({".lrv", ".lrf", ".thm"})
 def kind_of(path: Path) -> tuple[str, str] | None:
     """Return the kind of the file ``path`` by its ending, and the remedy; None if it may be a capture."""
     return next(((kind, hint) for kind, ends, hint in _KINDS if path.suffix.lower() in ends.split()), None)
+
+
+def remedy_in(folder: Path) -> str:
+    """Return a hint for a ``folder`` without images, which names a file in it that must be converted."""
+    files = [(path.name, kind_of(path)) for path in sorted(folder.iterdir()) if path.is_file()]
+    named = (f"{name} is {kind[0]}: {kind[1]}" for name, kind in files if kind and kind[1] != _GIVE)
+    return next(named, "give a video, a folder of images, a COLMAP project or transforms.json")
 
 
 def refused(path: Path, kind: str, hint: str) -> InputError:

@@ -265,3 +265,53 @@ def azure_kinect(root: Path, pictures: Pictures, poses: Poses) -> None:
         save(root / f"color/{index:05d}.jpg", picture)
         depth(root / f"depth/{index:05d}.png")
         save(root / f"ir/{index:05d}.png", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.uint16) * 16)
+
+
+def maps_by_name(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, normals and depth in colour in one folder, as networks write them."""
+    for index, picture in enumerate(pictures):
+        save(root / f"{index:04d}_rgb.png", picture)
+        save(root / f"{index:04d}_normal.png", picture[::-1])
+        save(root / f"depth_{index:04d}.png", cv2.applyColorMap(picture[:, :, 0], cv2.COLORMAP_JET))
+
+
+def hypersim(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Hypersim's previews: maps of several kinds in a folder of their own."""
+    for index, picture in enumerate(pictures):
+        save(root / f"images/scene_cam_00_final_preview/frame.{index:04d}.tonemap.jpg", picture)
+        for kind in ("normal_cam", "semantic"):
+            maps = root / "images/scene_cam_00_geometry_preview"
+            save(maps / f"frame.{index:04d}.{kind}.jpg", picture[::-1])
+
+
+def dtu(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """DTU, as NeuS has it: other zeros in the names of the masks."""
+    for index, picture in enumerate(pictures):
+        save(root / f"image/{index:06d}.png", picture)
+        save(root / f"mask/{index:03d}.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
+
+
+def dji_thermal(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A drone with a thermal camera: both lenses in one folder."""
+    for index, picture in enumerate(pictures):
+        save(root / f"DCIM/DJI_001/DJI_20240101_{index:04d}_V.JPG", picture)
+        save(root / f"DCIM/DJI_001/DJI_20240101_{index:04d}_T.JPG", picture[:200, ::-1])
+
+
+def photogrammetry(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs next to what programs made of them, and to a screenshot."""
+    for index, picture in enumerate(pictures):
+        save(root / f"photos/{index:04d}.jpg", picture)
+        save(root / f"output/3f2a/train/ours_7000/renders/{index:05d}.png", picture[::-1])
+        for work in ("MeshroomCache/PrepareDenseScene/1", "room.files/0/0", "odm_report"):
+            save(root / f"{work}/{index + 77}.png", picture[:, ::-1])
+    (root / "output/3f2a/cfg_args").touch()
+    save(root / "export/model_diffuse.png", pictures[0][:200, :200])
+    save(root / "Screenshot_20240101.png", pictures[0][:, :100])
+
+
+def exported(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, and the developed ones of darktable."""
+    for index, picture in enumerate(pictures):
+        save(root / f"DSC{index:04d}.JPG", picture)
+        save(root / f"darktable_exported/DSC{index:04d}.jpg", cv2.convertScaleAbs(picture, alpha=1.2))

@@ -52,6 +52,20 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "RealSense": (apps.realsense, 10, "20 infrared pictures (infrared/ 10, infrared2/ 10), 10 depth maps"),
     "RealSense Viewer": (apps.realsense_viewer, 10, "left out: 10 infrared pictures, 10 depth maps"),
     "Azure Kinect": (apps.azure_kinect, 10, "left out: 10 infrared pictures (ir/), 10 depth maps (depth/)"),
+    "maps by name": (apps.maps_by_name, 10, "left out: 20 second pictures"),
+    "Hypersim": (
+        apps.hypersim,
+        10,
+        "20 second pictures, reduced or in another format (images/scene_cam_00_geom",
+    ),
+    "DTU": (apps.dtu, 10, "10 photographs (image/) and 10 masks (mask/)"),
+    "thermal": (apps.dji_thermal, 10, "left out: 10 infrared pictures"),
+    "products": (
+        apps.photogrammetry,
+        10,
+        "10 photographs (photos/); left out: 2 pictures named as a texture",
+    ),
+    "exported": (apps.exported, 10, "left out: 10 second pictures"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
@@ -305,6 +319,13 @@ def test_masks_at_other_places(tmp_path: Path, frames: Frames, place: str) -> No
     stencils = [read_stencil(frame) for frame in capture.frames]
     assert len(stencils) == 10 and "and 10 masks" in capture.told
     assert [None if s is None else bool(s.all()) for s in stencils] == [False] + [True] * 9
+
+
+def test_masks_with_numbers_that_start_elsewhere_are_not_guessed(tmp_path: Path, frames: Frames) -> None:
+    root = write(apps.dtu, tmp_path / "capture", frames)
+    (root / "mask/000.png").rename(root / "mask/010.png")
+    capture = open_capture(root, IngestConfig())
+    assert "10 masks without a photograph of the same name" in capture.told
 
 
 def test_masks_that_fit_no_photograph_are_named(tmp_path: Path, frames: Frames) -> None:
