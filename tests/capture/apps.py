@@ -79,10 +79,9 @@ def nerfcapture(root: Path, pictures: Pictures, poses: Poses) -> None:
         depth(root / f"images/{index}.depth.png")
 
 
-def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
-    """Stray Scanner."""
-    root.mkdir(parents=True, exist_ok=True)
-    with av.open(root / "rgb.mp4", "w") as video:
+def clip(path: Path, pictures: Pictures) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(path, "w") as video:
         stream = video.add_stream("libx264", rate=10, options={"crf": "10", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for index, picture in enumerate(pictures):
@@ -90,6 +89,11 @@ def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
             frame.pts, frame.time_base = index, Fraction(1, 10)
             video.mux(stream.encode(frame))
         video.mux(stream.encode(None))
+
+
+def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Stray Scanner."""
+    clip(root / "rgb.mp4", pictures)
     (root / "camera_matrix.csv").write_text("\n".join(", ".join(map(str, row)) for row in K.tolist()))
     lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
     for index, pose in enumerate(poses):
@@ -276,7 +280,7 @@ def maps_by_name(root: Path, pictures: Pictures, poses: Poses) -> None:
 
 
 def hypersim(root: Path, pictures: Pictures, poses: Poses) -> None:
-    """Hypersim's previews: maps of several kinds in a folder of their own."""
+    """Hypersim's previews: maps of several kinds in a second folder."""
     for index, picture in enumerate(pictures):
         save(root / f"images/scene_cam_00_final_preview/frame.{index:04d}.tonemap.jpg", picture)
         for kind in ("normal_cam", "semantic"):
@@ -315,3 +319,39 @@ def exported(root: Path, pictures: Pictures, poses: Poses) -> None:
     for index, picture in enumerate(pictures):
         save(root / f"DSC{index:04d}.JPG", picture)
         save(root / f"darktable_exported/DSC{index:04d}.jpg", cv2.convertScaleAbs(picture, alpha=1.2))
+
+
+def upscaled(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, and what networks made of them."""
+    for index, picture in enumerate(pictures):
+        save(root / f"room/{index:04d}.png", picture)
+        save(root / f"upscaled_2x/{index:04d}.png", cv2.resize(picture, (2 * WIDTH, 2 * HEIGHT)))
+        save(root / f"renders/{index:04d}.png", picture[::-1])
+
+
+def blended_mvs(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """BlendedMVS: each picture also with a black background."""
+    for index, picture in enumerate(pictures):
+        save(root / f"blended_images/{index:08d}.jpg", picture)
+        save(root / f"blended_images/{index:08d}_masked.jpg", picture // 2)
+
+
+def sony(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A Sony's card: a small picture of each video."""
+    for index in range(4):
+        clip(root / f"PRIVATE/M4ROOT/CLIP/C{index:04d}.MP4", pictures)
+        save(root / f"PRIVATE/M4ROOT/THMBNL/C{index:04d}T01.JPG", cv2.resize(pictures[index], (160, 120)))
+
+
+def insta360(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Flat video of an Insta360, with its small copy."""
+    clip(root / "VID_20240101_120000_00_001.mp4", pictures)
+    clip(root / "LRV_20240101_120000_01_001.mp4", pictures)
+
+
+def edited_video(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A video with a proxy of a video editor, the same in another format, and a film in a folder below."""
+    clip(root / "walk.mp4", pictures)
+    clip(root / "walk.mkv", pictures[:3])
+    clip(root / "Proxies/walk.mp4", pictures)
+    clip(root / "old/film.mp4", pictures)

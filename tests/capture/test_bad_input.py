@@ -280,7 +280,7 @@ def test_a_file_of_another_kind_is_named(
 
 
 def test_a_small_copy_of_a_video_is_refused_only_next_to_it(tmp_path: Path, frames: Frames) -> None:
-    apps.stray(tmp_path, [image for _, image in frames], [])
+    apps.clip(tmp_path / "rgb.mp4", [image for _, image in frames])
     copy = (tmp_path / "rgb.mp4").rename(tmp_path / "GL010123.LRV")
     assert len(open_capture(copy, IngestConfig()).frames) > 2
     shutil.copy(copy, tmp_path / "GX010123.MP4")

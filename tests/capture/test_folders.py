@@ -66,6 +66,11 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
         "10 photographs (photos/); left out: 2 pictures named as a texture",
     ),
     "exported": (apps.exported, 10, "left out: 10 second pictures"),
+    "upscaled": (apps.upscaled, 10, "10 photographs (room/); left out: 20 second pictures"),
+    "BlendedMVS": (apps.blended_mvs, 10, "left out: 10 second pictures"),
+    "Sony": (apps.sony, 40, "4 videos (PRIVATE/M4ROOT/CLIP/); left out: 4 previews (PRIVATE/M4ROOT/THMBNL/)"),
+    "Insta360": (apps.insta360, 10, "1 video (VID_20240101_120000_00_001.mp4); left out: 1 preview (LRV"),
+    "edited video": (apps.edited_video, 10, "1 video in folders below (old/film.mp4), 1 preview (Proxies/"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
@@ -295,12 +300,10 @@ def test_a_capture_whose_name_is_a_number(tmp_path: Path, images: Path) -> None:
 
 
 def test_videos_next_to_few_photographs_are_the_capture(tmp_path: Path, frames: Frames) -> None:
-    write(apps.stray, tmp_path / "a", frames)
-    (tmp_path / "a/rgb.mp4").rename(tmp_path / "walk.mp4")
-    shutil.rmtree(tmp_path / "a")
+    apps.clip(tmp_path / "walk.mp4", [image for _, image in frames])
     cv2.imwrite(str(tmp_path / "poster.jpg"), frames[0][1])
     capture = open_capture(tmp_path, IngestConfig())
-    assert capture.kind == "video" and "1 photograph (poster.jpg)" in capture.told
+    assert capture.kind == "video" and "1 preview (poster.jpg)" in capture.told
     (tmp_path / "100GOPRO").mkdir()
     (tmp_path / "walk.mp4").rename(tmp_path / "100GOPRO/GX01.MP4")
     assert open_capture(tmp_path, IngestConfig()).kind == "video"
@@ -379,10 +382,8 @@ def test_a_backup_of_the_photographs_is_not_read_twice(images: Path, frames: Fra
 
 
 def test_videos_by_choice(tmp_path: Path, frames: Frames) -> None:
-    write(apps.stray, tmp_path / "a", frames)
     for name in ("walk1.mp4", "walk2.mp4"):
-        shutil.copy(tmp_path / "a/rgb.mp4", tmp_path / name)
-    shutil.rmtree(tmp_path / "a")
+        apps.clip(tmp_path / name, [image for _, image in frames])
     capture = open_capture(tmp_path, IngestConfig(only="walk2*"))
     assert {frame.path.name for frame in capture.frames} == {"walk2.mp4"}
     assert externals(tmp_path, IngestConfig(only="walk2*")) == {"capture": tmp_path / "walk2.mp4"}
