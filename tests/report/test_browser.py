@@ -160,11 +160,15 @@ def test_two_clicks_measure_and_give_the_scale(wide: Report, run: FinishedRun) -
     wide.settle()
     page.locator('[data-act="measure"]').click()
     box = page.locator(".live").bounding_box()
-    places = [(0.4, 0.5), (0.6, 0.55)]
-    for x, y in places:
-        page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
-        page.wait_for_timeout(300)
-    page.wait_for_function("window.reportMeasure.points.length === 2")
+    places, standing = [(0.4, 0.5), (0.6, 0.55)], wide.camera()
+    for count, (x, y) in enumerate(places, 1):
+        page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        wide.settle()  # a move that is drawn together with a click is a drag
+        page.mouse.down()
+        page.mouse.up()
+        page.wait_for_function(f"window.reportMeasure.points.length === {count}")
+        wide.settle()
+        assert np.allclose(wide.camera(), standing, atol=1e-6)  # the viewer itself turns to what is clicked
     points = np.array(page.evaluate("window.reportMeasure.points"))
     seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]

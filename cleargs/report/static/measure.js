@@ -187,6 +187,10 @@
   pane.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, { capture: true });
   pane.addEventListener("pointerup", async (event) => {
     if (!measures || !pressed || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 4) return; // a drag
+    // The viewer would turn its camera to the clicked point. It gets the end of the press, but no click.
+    event.stopPropagation();
+    const { pointerId, pointerType, button } = event;
+    event.target.dispatchEvent(new PointerEvent("pointercancel", { pointerId, pointerType, button, bubbles: true }));
     const { left, top } = pane.getBoundingClientRect();
     const point = await pick(event.clientX - left, event.clientY - top);
     if (point) points = points.length === 2 ? [point] : [...points, point];
