@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,7 +63,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
             stages.append(name)
             try:
                 made = results_folder(settings.folder, name)
-                if made is None or (made.exists() and not has_only_files(made)):
+                if made is None or (os.path.lexists(made) and not has_only_files(made)):
                     raise ValueError(
                         "there is a link or a device in it, or it is a link that leads elsewhere"
                     )

@@ -355,3 +355,10 @@ def edited_video(root: Path, pictures: Pictures, poses: Poses) -> None:
     clip(root / "walk.mkv", pictures[:3])
     clip(root / "Proxies/walk.mp4", pictures)
     clip(root / "old/film.mp4", pictures)
+
+
+def live_photographs(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """An iPhone's live photographs: a short video of each."""
+    for index, picture in enumerate(pictures):
+        save(root / f"IMG_{index:04d}.JPG", picture)
+        (root / f"IMG_{index:04d}.MOV").touch()

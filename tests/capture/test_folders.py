@@ -71,6 +71,7 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "Sony": (apps.sony, 40, "4 videos (PRIVATE/M4ROOT/CLIP/); left out: 4 previews (PRIVATE/M4ROOT/THMBNL/)"),
     "Insta360": (apps.insta360, 10, "1 video (VID_20240101_120000_00_001.mp4); left out: 1 preview (LRV"),
     "edited video": (apps.edited_video, 10, "1 video in folders below (old/film.mp4), 1 preview (Proxies/"),
+    "live": (apps.live_photographs, 10, "10 photographs; left out: 10 videos"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
