@@ -37,8 +37,8 @@ def formats(runs: Sequence[Path]) -> None:
     from cleargs.pipeline.stages import installed
     from cleargs.render.pruning import training_psnr
     from cleargs.run_results import scene_path, scene_stage
-    from cleargs.scene.views import real_views
     from cleargs.rva.tables import FRAMES
+    from cleargs.scene.views import real_views
     from cleargs.splat.formats import FORMATS, read_scene, write_scene
     from cleargs.splat.ply import read_ply
     from cleargs.splat.transforms import transform_scene

@@ -125,7 +125,7 @@ def link_or_copy(file: Path, path: Path) -> None:
     try:
         path.symlink_to(file)
     except OSError:
-        shutil.copy2(path.parent / file, path)
+        shutil.copyfile(path.parent / file, path)  # FAT32 refuses to copy permissions
 
 
 def make_folder(path: Path, *, empty: bool = False) -> None:

@@ -170,8 +170,17 @@ def linked_manifest(run: Path, stage: str) -> Manifest | None:
 def has_results(run: Path, stage: str) -> bool:
     """Return True if ``RUN/<stage>`` is a folder of files, or a link to one that the store made.
 
-    Such a link leads to ``<stage>/<key>``, and no folder of the store or of the run on its way is a link.
     A folder with a link, FIFO or device in it has no results.
+    """
+    folder = results_folder(run, stage)
+    return folder is not None and has_only_files(folder)
+
+
+def results_folder(run: Path, stage: str) -> Path | None:
+    """Return the folder ``RUN/<stage>``, or the one to which the store linked it; None for another link.
+
+    The store's link leads to ``<stage>/<key>``, and no folder of the store or of the run on its way is a
+    link. The folder need not exist.
     """
     folder = run / stage
     if folder.is_symlink():
@@ -179,10 +188,10 @@ def has_results(run: Path, stage: str) -> bool:
         folder = run / target
         way = [folder.parent, *(place for place in folder.parents if run in place.parents)]
         if not re.fullmatch(rf".+/{re.escape(name)}/[0-9a-f]{{64}}", target.as_posix()):
-            return False
+            return None
         if ".." in target.parts or any(map(Path.is_symlink, way)):
-            return False
-    return has_only_files(folder)
+            return None
+    return folder
 
 
 def hidden_link(run: Path, stage: str) -> Path:

@@ -14,13 +14,14 @@ import os
 import re
 import shutil
 import signal
+import sqlite3
 import subprocess
 import threading
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
-from cleargs.errors import StageError
+from cleargs.errors import StageError, StoreError
 from cleargs.files import disk_error
 from cleargs.progress import Reporter, Task
 from cleargs.subprocesses import module_command
@@ -75,16 +76,38 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
             with suppress(OSError):  # the processes have ended
                 os.killpg(child.pid, signal.SIGKILL)
     # On a full disk, COLMAP and SQLite fail with unrelated messages.
-    if status != 0 and shutil.disk_usage(log.parent).free < _FULL:
-        raise disk_error(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), log)
+    if status != 0:
+        disk = shutil.disk_usage(log.parent)
+        if disk.total and disk.free < _FULL:  # some network disks do not tell their size
+            raise disk_error(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), log)
     if failure is not None:
         raise failure
     if status != 0:
+        _require_databases(log.parent)
         reason = f"exit {status}" if status > 0 else signal.strsignal(-status)
         raise StageError(
             f"COLMAP stopped ({reason}): {_last_failure(log)}",
             hint="try other images, another ingest.camera_model or fewer ingest.max_features",
         )
+
+
+def _require_databases(folder: Path) -> None:
+    """Raise StoreError if SQLite cannot write in ``folder`` as COLMAP does, for example on a network disk."""
+    file = folder / "test.db"
+    try:
+        with closing(sqlite3.connect(file)) as opened:
+            opened.execute("PRAGMA journal_mode = WAL")
+            opened.execute("CREATE TABLE test (data BLOB)")
+            opened.execute("INSERT INTO test VALUES (zeroblob(100000))")
+            opened.commit()
+    except sqlite3.Error as error:
+        raise StoreError(
+            f"the disk of {folder} cannot hold the database of COLMAP ({error})",
+            hint="choose a --store on another disk; the run may stay on this one",
+        ) from error
+    finally:
+        for leftover in folder.glob("test.db*"):
+            leftover.unlink()
 
 
 def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | None:

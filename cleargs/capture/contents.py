@@ -21,6 +21,7 @@ from cleargs.capture.folders import (
     image_files,
     is_wanted,
     mask_externals,
+    masks_by_number,
     masks_of,
     natural_key,
     unmasked,
@@ -39,27 +40,44 @@ of their number, or if they have the numbers of others in their names."""
 
 _REDUCED = 0.75  # share of the long side up to which a folder with the names of another one has copies
 
-_SYSTEM = re.compile(r"[.@#]|__MACOSX$")  # start of the names of hidden folders and of those of network disks
+_SYSTEM = re.compile(r"[.@#]|(__MACOSX|MeshroomCache|odm_\w+|.+\.(files|cmvs))$")
+"""Names of hidden folders, of network disks' own, and of the work of Meshroom, ODM, Metashape, VisualSFM."""
+_RUNS = ("run.toml", "cfg_args")  # files in the results of ClearGS, and of the trainers that follow Inria's
 _MASK_FOLDER = re.compile(r"(.+[._-])?masks?", re.IGNORECASE)
 _PROCESSED = re.compile(
-    r"correct|undist|rectif|edit|resiz|enhanc|normal|semantic|segment|label|instance|albedo|depth|dispar|flow",
+    r"correct|undist|rectif|edit|resiz|enhanc|upscal|denois|sharpen|deblur|render|export|"
+    r"normal|semantic|segment|label|instance|albedo|depth|dispar|flow",
     re.IGNORECASE,
 )
+_PREVIEW_NAME = re.compile(r"thumb|thmbnl|preview|poster|contact.?sheet", re.IGNORECASE)
 _EDITED = re.compile(r"IMG_E(\d+)|(.+)[-_ ]edited|(.+) \(\d+\)", re.IGNORECASE)
 """Names of second versions: edited on iPhones, by Google Photos, and downloaded twice."""
-_PREVIEW_NAME = re.compile(r"thumb|preview|poster|contact.?sheet", re.IGNORECASE)
 
-MASKS, DEPTH, GREY = "mask%s", "depth map%s", "picture%s of one channel"
+
+def _words(words: str, more: str = "$.") -> re.Pattern[str]:
+    """Return a pattern for names with one of ``words``, between other characters than letters."""
+    return re.compile(rf"(.*[\W\d_])?({words})([\W\d_].*)?|{more}", re.IGNORECASE)
+
+
+_MAP = _words("normals?|semantics?|seg|segmentation|labels?|instances?|albedo|depths?|disparity|flow|masked")
+_INFRARED = _words("infra(red)?|n?ir|thermal", r"DJI_.+_T(HRM)?")
+_PRODUCT = _words("screen.?shot|texture|diffuse|map_kd|ortho(photo|mosaic)?|dsm|dem|pano(rama)?")
+_SMALL_VIDEO = _words("lrv|proxy|proxies|low.?res")
+
+MASKS, DEPTH, GREY, INFRARED = "mask%s", "depth map%s", "picture%s of one channel", "infrared picture%s"
 ALONE = "mask%s without a photograph of the same name"
+BELOW = "video%s in folders below"
 VIDEOS, RAW, UNREADABLE = "video%s", "raw or other picture%s", "HEIC picture%s without pillow-heif"
 PREVIEWS, COPIES, OUTSIDE = (
     "preview%s",
     "second picture%s, reduced or in another format",
     "picture%s outside images/",
 )
+PRODUCTS = "picture%s named as a texture, map, panorama or screenshot"
 PHOTOGRAPHS, UNWANTED = "photograph%s", "file%s by --only or --skip"
 _HINTS = {
     VIDEOS: "photographs are taken; for the videos, give one as the input, or set --skip for the photographs",
+    BELOW: "give their folder, or put all videos into one folder",
     ALONE: "name masks like their photographs",
     RAW: "convert them to JPEG or PNG",
     UNREADABLE: "pip install 'cleargs[heif]', or convert them to JPEG",
@@ -149,8 +167,11 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
         )
     left_out: dict[str, Sequence[Path]] = {UNWANTED: sorted(set(found) - set(wanted))}
     videos = [path for path in wanted if path.suffix.lower() in VIDEO_SUFFIXES]
-    videos = [path for path in videos if path.parent == root] or videos
-    videos.sort(key=lambda path: natural_key(path.relative_to(root).as_posix()))
+    small, copies = _small_videos(videos, root), _second_videos(videos)
+    videos = _without(videos, [*small, *copies])
+    top = [path for path in videos if path.parent == root] or videos
+    left_out[BELOW] = _without(videos, top)
+    videos = sorted(top, key=lambda path: natural_key(path.relative_to(root).as_posix()))
     left_out[RAW] = [path for path in wanted if path.suffix.lower() in RAW_SUFFIXES]
     images = [path for path in wanted if path.suffix.lower() in IMAGE_SUFFIXES]
     left_out[UNREADABLE] = [path for path in images if lacks_package(path)]
@@ -164,11 +185,18 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
         images = _without(images, left_out[OUTSIDE])
     left_out[MASKS] = _masks(images, root)
     headers = {path: read_header(path) for path in _without(images, left_out[MASKS])}
-    images, left_out[DEPTH], left_out[GREY] = _by_channels(headers)
-    left_out[PREVIEWS] = _previews(images, headers)
-    images = _without(images, left_out[PREVIEWS])
-    left_out[COPIES] = _copies(images, headers)
-    images = _without(images, left_out[COPIES])
+    left_out[INFRARED] = _infrared(headers, root)
+    shown = {path: header for path, header in headers.items() if path not in set(left_out[INFRARED])}
+    images, left_out[DEPTH], left_out[GREY] = _by_channels(shown)
+    previews = _previews(images, headers, root, few=not videos)
+    left_out[PREVIEWS] = [*previews, *small]
+    images = _without(images, previews)
+    products = [path for path in images if _PRODUCT.fullmatch(path.stem)]
+    left_out[PRODUCTS] = products if len(products) <= _FEW * (len(images) - len(products)) else []
+    images = _without(images, left_out[PRODUCTS])
+    second = _copies(images, headers)
+    left_out[COPIES] = [*second, *copies]
+    images = _without(images, second)
     only_maps = any(header and header.deep for header in headers.values())
     only_maps &= all(_is_grey(headers[path]) for path in images)
     is_video = bool(videos) and (len(images) < FEWEST or only_maps)
@@ -188,7 +216,8 @@ def media_files(root: Path) -> list[Path]:
     """Return pictures and videos below ``root``, without hidden ones and those of runs."""
     suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
     found = files_under(
-        root, lambda folder: bool(_SYSTEM.match(folder.name)) or (folder / "run.toml").is_file()
+        root,
+        lambda folder: bool(_SYSTEM.match(folder.name)) or any((folder / name).is_file() for name in _RUNS),
     )
     files = (path for path in found.values() if path.suffix.lower() in suffixes and path.is_file())
     return sorted(files, key=lambda path: (path.parent, path.name))
@@ -197,6 +226,11 @@ def media_files(root: Path) -> list[Path]:
 def _without(files: Sequence[Path], others: Sequence[Path]) -> list[Path]:
     gone = set(others)
     return [path for path in files if path not in gone]
+
+
+def _parts(path: Path, root: Path) -> tuple[str, ...]:
+    """Return the names of the folders below ``root`` on the way to ``path``, and its stem."""
+    return path.relative_to(root).with_suffix("").parts
 
 
 def _mask_folder(path: Path, root: Path) -> Path | None:
@@ -225,8 +259,16 @@ def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
     found = {by_stem[unmasked(mask)]: mask for mask in masks if unmasked(mask) in by_stem}
     for folder in dict.fromkeys(_mask_folder(mask, contents.root) for mask in masks):
         if folder is not None:
-            found |= {names[name]: mask for name, mask in masks_of(folder, list(names)).items()}
+            of = masks_of(folder, list(names)) or masks_by_number(folder, list(names))
+            found |= {names[name]: mask for name, mask in of.items()}
     return found
+
+
+def _infrared(headers: Mapping[Path, Header | None], root: Path) -> list[Path]:
+    """Return the pictures named as infrared, in any format. If there are few in colour, none is left out."""
+    found = [path for path in headers if any(map(_INFRARED.fullmatch, _parts(path, root)))]
+    colour = [path for path in _without(list(headers), found) if not _is_grey(headers[path])]
+    return found if len(colour) >= FEWEST else []
 
 
 def _is_grey(header: Header | None) -> bool:
@@ -246,10 +288,26 @@ def _by_channels(headers: Mapping[Path, Header | None]) -> tuple[list[Path], lis
     return ([*colour, *grey], deep, []) if grey else ([*colour, *deep], [], [])
 
 
-def _previews(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> list[Path]:
-    """Return pictures that are much smaller than the others, or have names of previews, and are few.
+def _small_videos(videos: Sequence[Path], root: Path) -> list[Path]:
+    """Return the videos named as previews or proxies of others; none if there are no others."""
+    small = [path for path in videos if any(map(_SMALL_VIDEO.fullmatch, _parts(path, root)))]
+    return small if len(small) < len(videos) else []
 
-    Small ones that are numbered like the others need not be few.
+
+def _second_videos(videos: Sequence[Path]) -> list[Path]:
+    """Return the smaller ones of files with one stem in one folder: a video in two formats."""
+    largest: dict[Path, Path] = {}
+    for path in sorted(videos, key=lambda path: -path.stat().st_size):
+        largest.setdefault(path.with_suffix(""), path)
+    return _without(videos, list(largest.values()))
+
+
+def _previews(
+    images: Sequence[Path], headers: Mapping[Path, Header | None], root: Path, *, few: bool
+) -> list[Path]:
+    """Return pictures that are much smaller than the others and few, or have the numbers of others.
+
+    Those with names of previews count too, if they are ``few`` or that does not matter (next to videos).
     """
     sizes = {path: header.size for path in images if (header := headers[path]) is not None}
     counts = Counter(sizes.values())
@@ -261,8 +319,8 @@ def _previews(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> 
     small = [path for path in sizes if max(sizes[path]) <= _SMALL * max(main)]
     paired = [path for path in small if (path.parent, *re.findall(r"\d+", path.stem)) in numbers]
     found = small if len(small) <= _FEW * len(others) else paired
-    named = [path for path in others if _PREVIEW_NAME.search(path.stem)]
-    return sorted({*found, *(named if len(named) <= _FEW * len(others) else [])})
+    named = [path for path in others if any(map(_PREVIEW_NAME.search, _parts(path, root)[-2:]))]
+    return sorted({*found, *(named if not few or len(named) <= _FEW * len(others) else [])})
 
 
 def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> list[Path]:
@@ -273,6 +331,7 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
     stems: dict[Path, Path] = {}
     second = [path for path in images if stems.setdefault(path.with_suffix(""), path) is not path]
     second += [path for path in _without(images, second) if _is_second(path, stems)]
+    second += _maps(_without(images, second))
     folders: dict[Path, dict[str, Path]] = defaultdict(dict)
     for path in _without(images, second):
         folders[path.parent][path.stem.lower()] = path
@@ -292,6 +351,19 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
         else:
             kept.append(files)
     return second
+
+
+def _maps(images: Sequence[Path]) -> list[Path]:
+    """Return pictures named as normals, labels or depth that have the number of another picture."""
+    maps = [path for path in images if _MAP.fullmatch(path.stem)]
+    numbers = {_numbers(path) for path in _without(images, maps)} - {()}
+    return [
+        path for path in maps if any(_numbers(path)[: n + 1] in numbers for n in range(len(_numbers(path))))
+    ]
+
+
+def _numbers(path: Path) -> tuple[str, ...]:
+    return tuple(re.findall(r"\d+", path.stem))
 
 
 def _is_second(path: Path, stems: Mapping[Path, Path]) -> bool:

@@ -166,6 +166,18 @@ def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
     return masks
 
 
+def masks_by_number(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return the masks in ``folder`` by the names of their images, if both names are numbers (DTU).
+
+    The zeros in front may differ. None is returned if a mask has no image: it may count from another number.
+    """
+    files = image_files(folder, below=True)
+    images = {int(stem): name for name in names if (stem := PurePosixPath(name).stem).isdecimal()}
+    masks = {int(path.stem): path for path in files if path.stem.isdecimal()}
+    whole = len(images) == len(names) and len(masks) == len(files) and masks.keys() <= images.keys()
+    return {images[number]: path for number, path in masks.items()} if whole else {}
+
+
 def chosen(
     frames: Sequence[SourceFrame], source: Path, at_most: int, names: Sequence[str] | None = None
 ) -> tuple[SourceFrame, ...]:

@@ -10,6 +10,7 @@ from cleargs.capture.capture import Capture, External, Layout
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import media_files
 from cleargs.capture.layouts import colmap, images, llff, rgbd, transforms, video
+from cleargs.capture.other_files import is_small_copy, kind_of, refused
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.plugins import load_plugin
@@ -73,6 +74,17 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, or a folder of images")
+    try:
+        return _opened(source, config)
+    except InputError as error:
+        if source.is_file() and (kind := kind_of(source)) is not None:
+            raise refused(source, *kind) from error
+        raise
+
+
+def _opened(source: Path, config: CaptureConfig) -> Capture:
+    if is_small_copy(source):
+        raise InputError(f"{source.name} is a small copy", hint="give the video to which it belongs")
     capture = layout_of(source, config).open_capture(source, config)
     if capture.kind != "video" and (config.start is not None or config.end is not None):
         raise InputError(

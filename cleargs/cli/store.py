@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,8 +14,8 @@ from cleargs.cli.common import FOLDER, answer, json_option, run_argument, store_
 from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.files import remove
-from cleargs.manifest import MANIFEST, Manifest, damages, has_results, read_manifest
-from cleargs.own_files import leftovers, refuse_links, size_of
+from cleargs.manifest import MANIFEST, Manifest, damages, read_manifest, results_folder
+from cleargs.own_files import has_only_files, leftovers, refuse_links, size_of
 from cleargs.packed import read_pack
 from cleargs.pipeline.run_file import SCENE, RunSpec, read_run_file
 from cleargs.pipeline.session import opened_store
@@ -61,11 +62,12 @@ def verify(dag: Stages, run: Path, store: Path | None, as_json: bool) -> int:
                 continue  # no results yet; a copy of a run has folders instead of links
             stages.append(name)
             try:
-                if folder.exists() and not has_results(settings.folder, name):
+                made = results_folder(settings.folder, name)
+                if made is None or (os.path.lexists(made) and not has_only_files(made)):
                     raise ValueError(
                         "there is a link or a device in it, or it is a link that leads elsewhere"
                     )
-                manifest = read_manifest(folder)
+                manifest = read_manifest(made)
             except (OSError, ValueError) as error:
                 gone = f"{MANIFEST} is missing" if listed else "it is no longer in the store"
                 text = gone if isinstance(error, OSError) else str(error)

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from filecmp import cmp
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -124,7 +125,7 @@ class Runner(Planner):
             if (self._has_scene_link() and link.readlink() not in targets[-1:]) or (
                 copied
                 and link.is_file()
-                and (not targets or link.stat().st_mtime != (folder / targets[-1]).stat().st_mtime)
+                and (not targets or not cmp(link, folder / targets[-1], shallow=False))
             ):
                 link.unlink()
             if targets and not link.is_symlink() and not link.exists():

@@ -24,7 +24,7 @@ import re
 import secrets
 import shutil
 import socket
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +34,7 @@ from cleargs.digest import DigestMemo
 from cleargs.errors import InputError, StoreError, listed
 from cleargs.files import disk_errors, is_partial, remove, sync, sync_tree, write_bytes
 from cleargs.manifest import MANIFEST, Manifest, damages, hidden_link, read_manifest, write_manifest
-from cleargs.own_files import drop_links, has_only_files, refuse_links, size_of
+from cleargs.own_files import drop_links, has_only_files, refuse_links, regular_files, size_of
 from cleargs.pipeline.lock import exclusive_lock, file_lock, is_locked
 from cleargs.progress import Reporter
 from cleargs.safe_io import FAULTS, read_bytes
@@ -445,10 +445,17 @@ def _link_files(source: Path, target: Path) -> None:
     rename keeps a killed copy from being mistaken for a complete one.
     """
     temporary = target.with_name(f"{target.name}.carried")
-    shutil.rmtree(temporary, ignore_errors=True)
     try:
-        shutil.copytree(source, temporary, copy_function=os.link)
-    except OSError:  # includes shutil.Error
-        shutil.rmtree(temporary)
-        shutil.copytree(source, temporary)
+        _each_file(os.link, source, temporary)
+    except OSError:
+        _each_file(shutil.copyfile, source, temporary)  # FAT32 refuses to copy permissions
     temporary.rename(target)
+
+
+def _each_file(copy: Callable[[Path, Path], object], source: Path, target: Path) -> None:
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    for file in regular_files(source):
+        place = target / file.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        copy(file, place)

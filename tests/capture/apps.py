@@ -79,10 +79,9 @@ def nerfcapture(root: Path, pictures: Pictures, poses: Poses) -> None:
         depth(root / f"images/{index}.depth.png")
 
 
-def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
-    """Stray Scanner."""
-    root.mkdir(parents=True)
-    with av.open(root / "rgb.mp4", "w") as video:
+def clip(path: Path, pictures: Pictures) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(path, "w") as video:
         stream = video.add_stream("libx264", rate=10, options={"crf": "10", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for index, picture in enumerate(pictures):
@@ -90,6 +89,11 @@ def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
             frame.pts, frame.time_base = index, Fraction(1, 10)
             video.mux(stream.encode(frame))
         video.mux(stream.encode(None))
+
+
+def stray(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Stray Scanner."""
+    clip(root / "rgb.mp4", pictures)
     (root / "camera_matrix.csv").write_text("\n".join(", ".join(map(str, row)) for row in K.tolist()))
     lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
     for index, pose in enumerate(poses):
@@ -240,3 +244,121 @@ def edited_and_downloaded_twice(root: Path, pictures: Pictures, poses: Poses) ->
     save(root / "IMG_E0001.JPG", pictures[1][::-1])
     save(root / "IMG_0002-edited.JPG", pictures[2][::-1])
     save(root / "IMG_0003 (1).JPG", pictures[3])
+
+
+def realsense(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Intel RealSense's recorder: a folder per sensor. The second infrared sensor was saved in colour."""
+    for index, picture in enumerate(pictures):
+        save(root / f"color/{index:06d}.jpg", picture)
+        depth(root / f"depth/{index:06d}.png")
+        save(root / f"infrared/{index:06d}.png", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        save(root / f"infrared2/{index:06d}.png", picture)
+
+
+def realsense_viewer(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Snapshots of Intel's viewer: all sensors in one folder."""
+    for index, picture in enumerate(pictures):
+        save(root / f"room_Color_{index}.png", picture)
+        depth(root / f"room_Depth_{index}.png")
+        save(root / f"room_Infrared_{index}.png", picture)
+
+
+def azure_kinect(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Azure Kinect: infrared of 16 bits, smaller than the colour."""
+    for index, picture in enumerate(pictures):
+        save(root / f"color/{index:05d}.jpg", picture)
+        depth(root / f"depth/{index:05d}.png")
+        save(root / f"ir/{index:05d}.png", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.uint16) * 16)
+
+
+def maps_by_name(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, normals and depth in colour in one folder, as networks write them."""
+    for index, picture in enumerate(pictures):
+        save(root / f"{index:04d}_rgb.png", picture)
+        save(root / f"{index:04d}_normal.png", picture[::-1])
+        save(root / f"depth_{index:04d}.png", cv2.applyColorMap(picture[:, :, 0], cv2.COLORMAP_JET))
+
+
+def hypersim(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Hypersim's previews: maps of several kinds in a second folder."""
+    for index, picture in enumerate(pictures):
+        save(root / f"images/scene_cam_00_final_preview/frame.{index:04d}.tonemap.jpg", picture)
+        for kind in ("normal_cam", "semantic"):
+            maps = root / "images/scene_cam_00_geometry_preview"
+            save(maps / f"frame.{index:04d}.{kind}.jpg", picture[::-1])
+
+
+def dtu(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """DTU, as NeuS has it: other zeros in the names of the masks."""
+    for index, picture in enumerate(pictures):
+        save(root / f"image/{index:06d}.png", picture)
+        save(root / f"mask/{index:03d}.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
+
+
+def dji_thermal(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A drone with a thermal camera: both lenses in one folder."""
+    for index, picture in enumerate(pictures):
+        save(root / f"DCIM/DJI_001/DJI_20240101_{index:04d}_V.JPG", picture)
+        save(root / f"DCIM/DJI_001/DJI_20240101_{index:04d}_T.JPG", picture[:200, ::-1])
+
+
+def photogrammetry(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs next to what programs made of them, and to a screenshot."""
+    for index, picture in enumerate(pictures):
+        save(root / f"photos/{index:04d}.jpg", picture)
+        save(root / f"output/3f2a/train/ours_7000/renders/{index:05d}.png", picture[::-1])
+        for work in ("MeshroomCache/PrepareDenseScene/1", "room.files/0/0", "odm_report"):
+            save(root / f"{work}/{index + 77}.png", picture[:, ::-1])
+    (root / "output/3f2a/cfg_args").touch()
+    save(root / "export/model_diffuse.png", pictures[0][:200, :200])
+    save(root / "Screenshot_20240101.png", pictures[0][:, :100])
+
+
+def exported(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, and the developed ones of darktable."""
+    for index, picture in enumerate(pictures):
+        save(root / f"DSC{index:04d}.JPG", picture)
+        save(root / f"darktable_exported/DSC{index:04d}.jpg", cv2.convertScaleAbs(picture, alpha=1.2))
+
+
+def upscaled(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, and what networks made of them."""
+    for index, picture in enumerate(pictures):
+        save(root / f"room/{index:04d}.png", picture)
+        save(root / f"upscaled_2x/{index:04d}.png", cv2.resize(picture, (2 * WIDTH, 2 * HEIGHT)))
+        save(root / f"renders/{index:04d}.png", picture[::-1])
+
+
+def blended_mvs(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """BlendedMVS: each picture also with a black background."""
+    for index, picture in enumerate(pictures):
+        save(root / f"blended_images/{index:08d}.jpg", picture)
+        save(root / f"blended_images/{index:08d}_masked.jpg", picture // 2)
+
+
+def sony(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A Sony's card: a small picture of each video."""
+    for index in range(4):
+        clip(root / f"PRIVATE/M4ROOT/CLIP/C{index:04d}.MP4", pictures)
+        save(root / f"PRIVATE/M4ROOT/THMBNL/C{index:04d}T01.JPG", cv2.resize(pictures[index], (160, 120)))
+
+
+def insta360(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Flat video of an Insta360, with its small copy."""
+    clip(root / "VID_20240101_120000_00_001.mp4", pictures)
+    clip(root / "LRV_20240101_120000_01_001.mp4", pictures)
+
+
+def edited_video(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A video with a proxy of a video editor, the same in another format, and a film in a folder below."""
+    clip(root / "walk.mp4", pictures)
+    clip(root / "walk.mkv", pictures[:3])
+    clip(root / "Proxies/walk.mp4", pictures)
+    clip(root / "old/film.mp4", pictures)
+
+
+def live_photographs(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """An iPhone's live photographs: a short video of each."""
+    for index, picture in enumerate(pictures):
+        save(root / f"IMG_{index:04d}.JPG", picture)
+        (root / f"IMG_{index:04d}.MOV").touch()

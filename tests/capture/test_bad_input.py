@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cleargs.capture.sources import open_capture
 from cleargs.capture.tables import load_points
@@ -19,7 +22,10 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.stages import installed
 from cleargs.stages.ingest import IngestConfig
 
+from . import apps
 from .conftest import HEIGHT, WIDTH, Ingest, camera_to_world, write_transforms
+
+Frames: TypeAlias = Sequence[tuple[NDArray[np.float64], NDArray[np.uint8]]]
 
 
 def refused(caught: pytest.ExceptionInfo[CleargsError]) -> bool:
@@ -241,3 +247,50 @@ def test_a_mask_of_one_pixel(posed: Path, ingest: Ingest) -> None:
     cv2.imwrite(str(posed / "masks" / "003.png"), np.full((1, 1), 255, np.uint8))
     with pytest.raises(InputError, match=r"the mask of images/003\.png is far smaller than it"):
         ingest(posed)
+
+
+# -- files other than captures ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "beside", "kind", "remedy"),
+    [
+        ("IMG_1.xmp", "IMG_1.jpg", "a file of a photo editor", "give its folder"),
+        ("IMG_1.AAE", "IMG_1.HEIC", "a list of edits of an iPhone photograph", "give its folder"),
+        ("GX010123.THM", "GX010123.MP4", "the preview of a video", "GX010123.MP4, the video"),
+        ("GL010123.LRV", "GX010123.MP4", "the small copy of a video", "GX010123.MP4, the video"),
+        ("DJI_0001.SRT", "DJI_0001.MP4", "a file of subtitles or of a flight", "DJI_0001.MP4, the video"),
+        ("info.json", "frame_0.jpg", "a file of data", "which has pictures"),
+        ("info.json", None, "a file of data", "give a video, or a folder of images"),
+        ("IMG_1.DNG", None, "a raw or other picture", "convert it to JPEG or PNG"),
+        ("room.zip", None, "an archive", "unpack it"),
+        ("scene.ply", None, "a 3D scene or model", "cleargs export, render and eval"),
+    ],
+)
+def test_a_file_of_another_kind_is_named(
+    tmp_path: Path, name: str, beside: str | None, kind: str, remedy: str
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((24, 32, 3), np.uint8))
+    (tmp_path / "a.jpg").rename(tmp_path / name)  # FFmpeg reads it, as it reads real previews
+    if beside is not None:
+        (tmp_path / beside).write_bytes(b"-")
+    with pytest.raises(InputError, match=f"{name} is {kind}") as caught:
+        open_capture(tmp_path / name, IngestConfig())
+    assert refused(caught) and remedy in str(caught.value.hint)
+
+
+def test_a_small_copy_of_a_video_is_refused_only_next_to_it(tmp_path: Path, frames: Frames) -> None:
+    apps.clip(tmp_path / "rgb.mp4", [image for _, image in frames])
+    copy = (tmp_path / "rgb.mp4").rename(tmp_path / "GL010123.LRV")
+    assert len(open_capture(copy, IngestConfig()).frames) > 2
+    shutil.copy(copy, tmp_path / "GX010123.MP4")
+    with pytest.raises(InputError, match="the small copy of a video") as caught:
+        open_capture(copy, IngestConfig())
+    assert "GX010123.MP4, the video" in str(caught.value.hint)
+
+
+def test_a_folder_without_pictures_names_what_it_has(tmp_path: Path) -> None:
+    (tmp_path / "room.zip").write_bytes(b"PK")
+    with pytest.raises(InputError, match="holds no images") as caught:
+        open_capture(tmp_path, IngestConfig())
+    assert caught.value.hint == "room.zip is an archive: unpack it, and give its folder"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -182,3 +184,22 @@ def test_a_full_disk_is_the_cause(module: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(StoreError, match="no space left") as caught:
         run(module)
     assert "free some space" in caught.value.hint
+
+
+def test_a_disk_that_tells_no_size_is_not_called_full(module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As FUSE's FAT32 and some network shares."""
+    monkeypatch.setattr(child.shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(0, 0, 0))
+    module.write_text(PREAMBLE + "raise ValueError('no such thing')\n")
+    with pytest.raises(StageError, match="no such thing"):
+        run(module)
+
+
+def test_a_disk_that_holds_no_database_is_named(module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def connect(file: Path) -> None:
+        raise sqlite3.OperationalError("disk I/O error")
+
+    monkeypatch.setattr(child.sqlite3, "connect", connect)
+    module.write_text(PREAMBLE + "raise ValueError('no such thing')\n")
+    with pytest.raises(StoreError, match="cannot hold the database") as caught:
+        run(module)
+    assert "--store on another disk" in str(caught.value.hint)

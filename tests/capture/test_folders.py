@@ -49,6 +49,29 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "ScanNet++": (apps.scannetpp, 10, "and 10 masks (iphone/rgb_masks/); left out: 10 depth maps"),
     "maps": (apps.monocular_maps, 10, "10 photographs (rgb/); left out: 20 second pictures"),
     "edited": (apps.edited_and_downloaded_twice, 10, "left out: 3 second pictures"),
+    "RealSense": (apps.realsense, 10, "20 infrared pictures (infrared/ 10, infrared2/ 10), 10 depth maps"),
+    "RealSense Viewer": (apps.realsense_viewer, 10, "left out: 10 infrared pictures, 10 depth maps"),
+    "Azure Kinect": (apps.azure_kinect, 10, "left out: 10 infrared pictures (ir/), 10 depth maps (depth/)"),
+    "maps by name": (apps.maps_by_name, 10, "left out: 20 second pictures"),
+    "Hypersim": (
+        apps.hypersim,
+        10,
+        "20 second pictures, reduced or in another format (images/scene_cam_00_geom",
+    ),
+    "DTU": (apps.dtu, 10, "10 photographs (image/) and 10 masks (mask/)"),
+    "thermal": (apps.dji_thermal, 10, "left out: 10 infrared pictures"),
+    "products": (
+        apps.photogrammetry,
+        10,
+        "10 photographs (photos/); left out: 2 pictures named as a texture",
+    ),
+    "exported": (apps.exported, 10, "left out: 10 second pictures"),
+    "upscaled": (apps.upscaled, 10, "10 photographs (room/); left out: 20 second pictures"),
+    "BlendedMVS": (apps.blended_mvs, 10, "left out: 10 second pictures"),
+    "Sony": (apps.sony, 40, "4 videos (PRIVATE/M4ROOT/CLIP/); left out: 4 previews (PRIVATE/M4ROOT/THMBNL/)"),
+    "Insta360": (apps.insta360, 10, "1 video (VID_20240101_120000_00_001.mp4); left out: 1 preview (LRV"),
+    "edited video": (apps.edited_video, 10, "1 video in folders below (old/film.mp4), 1 preview (Proxies/"),
+    "live": (apps.live_photographs, 10, "10 photographs; left out: 10 videos"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
@@ -61,7 +84,7 @@ def test_photographs_are_read_and_the_rest_is_told(tmp_path: Path, frames: Frame
         capture = open_capture(root, IngestConfig(poses=poses))
         assert len(capture.frames) == capture.n_available == count
         assert poses == "sfm" or told in capture.told
-        depths = ("depth", "conf", "thumb", "mask", "cover", "web")
+        depths = ("depth", "conf", "thumb", "mask", "cover", "web", "infra", "ir/")
         assert not any(word in frame.name for frame in capture.frames for word in depths)
         named = externals(root, IngestConfig(poses=poses)).values()
         files = {p for place in named for p in (place.values() if isinstance(place, dict) else [place])}
@@ -172,6 +195,12 @@ def test_photographs_of_a_thermal_camera_have_16_bits(images: Path) -> None:
     assert len(open_capture(images, IngestConfig()).frames) == 10
 
 
+def test_photographs_of_an_infrared_camera_alone_are_taken(images: Path) -> None:
+    images.rename(images.with_name("infrared"))
+    capture = open_capture(images.parent, IngestConfig())
+    assert (len(capture.frames), capture.told) == (10, "read: 10 photographs (infrared/)")
+
+
 def test_two_lenses_of_a_phone_stay(images: Path) -> None:
     """Half the size, but as many, and other pictures."""
     for index, path in enumerate(sorted(images.iterdir())):
@@ -272,12 +301,10 @@ def test_a_capture_whose_name_is_a_number(tmp_path: Path, images: Path) -> None:
 
 
 def test_videos_next_to_few_photographs_are_the_capture(tmp_path: Path, frames: Frames) -> None:
-    write(apps.stray, tmp_path / "a", frames)
-    (tmp_path / "a/rgb.mp4").rename(tmp_path / "walk.mp4")
-    shutil.rmtree(tmp_path / "a")
+    apps.clip(tmp_path / "walk.mp4", [image for _, image in frames])
     cv2.imwrite(str(tmp_path / "poster.jpg"), frames[0][1])
     capture = open_capture(tmp_path, IngestConfig())
-    assert capture.kind == "video" and "1 photograph (poster.jpg)" in capture.told
+    assert capture.kind == "video" and "1 preview (poster.jpg)" in capture.told
     (tmp_path / "100GOPRO").mkdir()
     (tmp_path / "walk.mp4").rename(tmp_path / "100GOPRO/GX01.MP4")
     assert open_capture(tmp_path, IngestConfig()).kind == "video"
@@ -296,6 +323,13 @@ def test_masks_at_other_places(tmp_path: Path, frames: Frames, place: str) -> No
     stencils = [read_stencil(frame) for frame in capture.frames]
     assert len(stencils) == 10 and "and 10 masks" in capture.told
     assert [None if s is None else bool(s.all()) for s in stencils] == [False] + [True] * 9
+
+
+def test_masks_with_numbers_that_start_elsewhere_are_not_guessed(tmp_path: Path, frames: Frames) -> None:
+    root = write(apps.dtu, tmp_path / "capture", frames)
+    (root / "mask/000.png").rename(root / "mask/010.png")
+    capture = open_capture(root, IngestConfig())
+    assert "10 masks without a photograph of the same name" in capture.told
 
 
 def test_masks_that_fit_no_photograph_are_named(tmp_path: Path, frames: Frames) -> None:
@@ -349,10 +383,8 @@ def test_a_backup_of_the_photographs_is_not_read_twice(images: Path, frames: Fra
 
 
 def test_videos_by_choice(tmp_path: Path, frames: Frames) -> None:
-    write(apps.stray, tmp_path / "a", frames)
     for name in ("walk1.mp4", "walk2.mp4"):
-        shutil.copy(tmp_path / "a/rgb.mp4", tmp_path / name)
-    shutil.rmtree(tmp_path / "a")
+        apps.clip(tmp_path / name, [image for _, image in frames])
     capture = open_capture(tmp_path, IngestConfig(only="walk2*"))
     assert {frame.path.name for frame in capture.frames} == {"walk2.mp4"}
     assert externals(tmp_path, IngestConfig(only="walk2*")) == {"capture": tmp_path / "walk2.mp4"}

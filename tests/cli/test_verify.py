@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from toy import Bench, make_bench
 
+from cleargs.cli import store as store_commands
 from cleargs.cli.main import invoke
 from cleargs.digest import DigestMemo, file_digest
 
@@ -84,3 +85,25 @@ def test_a_run_without_results_is_not_called_healthy(
         (bench.folder / name).unlink()
     assert invoke(["verify", str(bench.folder)], bench.dag) == 2
     assert "has no results yet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("target", ["gone", "../outside", "count"])
+@pytest.mark.parametrize("in_store", [False, True])
+def test_a_link_that_the_store_did_not_make_is_not_opened(
+    bench: Bench,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    target: str,
+    in_store: bool,
+) -> None:
+    place = (bench.folder / "count").resolve() if in_store else bench.folder / "count"
+    place.rename(bench.root / "away")
+    place.symlink_to(target)
+    opened: list[Path] = []
+    read = store_commands.read_manifest
+    monkeypatch.setattr(
+        store_commands, "read_manifest", lambda folder: (opened.append(folder), read(folder))[1]
+    )
+    assert invoke(["verify", str(bench.folder)], bench.dag) == 1
+    assert "count        there is a link or a device in it, or it is a link" in capsys.readouterr().out
+    assert len(opened) == 2 and place not in opened

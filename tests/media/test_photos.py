@@ -239,3 +239,16 @@ def test_of_a_series_in_one_file_the_first_picture_is_read(tmp_path: Path, suffi
     Image.fromarray(stripes()).save(path, kind, save_all=True, append_images=[second], quality=95)
     assert image_size(path) == (64, 40)
     assert np.abs(read_rgb(path).astype(int) - stripes())[5:15, 4::16].max() < 12
+
+
+@pytest.mark.parametrize("name", ["a.mpo", "a.avifs", "a.HIF", "a.heics"])
+def test_the_first_picture_of_several_is_read(tmp_path: Path, name: str) -> None:
+    """Pictures for 3D screens, animations, and what Canon, Sony and bursts of phones write."""
+    kind = {"mpo": "MPO", "avifs": "AVIF"}.get(name[2:], "HEIF")
+    if kind == "HEIF":
+        reason = "the extra cleargs[heif] is not installed"
+        pytest.importorskip("pillow_heif", reason=reason).register_heif_opener()
+    other = Image.fromarray(255 - stripes())
+    Image.fromarray(stripes()).save(tmp_path / name, kind, save_all=True, append_images=[other], quality=95)
+    assert image_size(tmp_path / name) == (64, 40)
+    assert np.abs(read_rgb(tmp_path / name).astype(int) - stripes())[5:15, 4::16].max() < 12

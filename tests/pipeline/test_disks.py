@@ -21,13 +21,13 @@ from cleargs.run_results import scene_stage
 
 @pytest.fixture
 def no_links(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refuse links with the error of exFAT on Linux."""
+    """Refuse links and permissions with the error of exFAT and FAT32 on Linux."""
 
     def refuse(*paths: object, **options: object) -> None:
         raise OSError(38, "Function not implemented")
 
-    monkeypatch.setattr(os, "symlink", refuse)
-    monkeypatch.setattr(os, "link", refuse)
+    for name in ("symlink", "link", "chmod"):
+        monkeypatch.setattr(os, name, refuse)
 
 
 def text(bench: Bench, stage: str = "total") -> str:

@@ -9,6 +9,7 @@ from cleargs.capture.capture import Capture, External
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import contents_of
 from cleargs.capture.folders import chosen
+from cleargs.capture.other_files import remedy_in
 from cleargs.errors import InputError
 
 _LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
@@ -28,10 +29,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     contents = contents_of(source, config)
     frames = contents.frames()
     if not frames:
-        raise InputError(
-            f"{source} holds no images, no video and no transforms.json",
-            hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
-        )
+        raise InputError(f"{source} holds no images, no video and no transforms.json", hint=remedy_in(source))
     patterns = [*(f"*/{name}" for name in _LISTS), "dense/*/sparse"] if config.uses_poses else []
     nested = [path for pattern in patterns for path in sorted(source.glob(pattern))]
     notes = [f"poses in {path} are not read: give {path.parent} as the input" for path in nested[:1]]
