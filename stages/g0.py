@@ -13,7 +13,7 @@ from cleargs.types import Device
 
 from .config import G0Config
 
-VERSION = 47
+VERSION = 48
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {

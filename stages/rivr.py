@@ -95,7 +95,7 @@ class RivrConfig(RepairConfig):
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 54
+VERSION = 55
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {

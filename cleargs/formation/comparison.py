@@ -147,11 +147,16 @@ class Level:
     @cached_property
     def nearness(self) -> ArrayF32:
         """Median depth over depth, [H, W], as in the kernel `displacements`."""
-        depth, alpha = (self._reduced(image) for image in (self._pair.depth, self._pair.alpha))
+        depth, alpha = self._reduced_depth
         seen = (alpha > MIN_COVERED) & (depth > 0.0)
         near = np.ones_like(depth)
         near[seen] = np.minimum(np.float32(self.median) * alpha[seen] / depth[seen], MAX_NEARNESS)
         return near
+
+    @cached_property
+    def _reduced_depth(self) -> tuple[ArrayF32, ArrayF32]:
+        """Accumulated depth and alpha, [H, W] each."""
+        return self._reduced(self._pair.depth), self._reduced(self._pair.alpha)
 
     @cached_property
     def _basis(self) -> ArrayF32:
@@ -197,18 +202,28 @@ class Level:
         def flow(twist: ArrayF64) -> ArrayF32:
             return cpu.flow(self._basis, twist) if twist.any() else self._nowhere
 
-        offset = flow(motion.pose)
-        if motion.skew.any():
-            read = self._across if motion.columns else self._down[:, None]
-            offset = offset + flow(motion.skew) * read
-            if motion.skew_bend.any():
-                offset = offset + flow(motion.skew_bend) * read**2
+        offset = self._read(motion) if motion.skew.any() else flow(motion.pose)
         radius = self._nowhere[0]
         if motion.disc_px > 0.0:
             disc = np.float32(motion.disc_px * self.scale)
             radius = np.abs(self.nearness - np.float32(motion.focus)) * disc
         curve = np.concatenate([flow(motion.bend), flow(motion.cube)]) if curved else None
         return offset, flow(motion.blur), radius, curve
+
+    def _read(self, motion: FrameMotion) -> ArrayF32:
+        """Return the displacements [2, H, W] by the pose and the rolling shutter."""
+        camera = widened(self._pair.camera, self._pair.margin)
+        height, width = self._image.shape
+        right, down = width / camera.width, height / camera.height
+        lens = [right * camera.fx, down * camera.fy, right * camera.cx, down * camera.cy, self.median]
+        columns = np.float32(motion.columns)
+        return cpu.read_displacements(
+            *self._reduced_depth,
+            np.array(lens, np.float32),
+            (right * np.stack([motion.pose, motion.skew, motion.skew_bend])).astype(np.float32),
+            (1 - columns) * self._down,
+            columns * self._across,
+        )
 
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:
         """Return matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""

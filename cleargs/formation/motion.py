@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from cleargs.splat.camera import Camera
+from cleargs.splat.camera import Camera, Readout
 from cleargs.types import ArrayF32, ArrayF64
 
 TWIST = 6
@@ -71,10 +71,28 @@ class FrameMotion:
         pose, blur, skew, bend, cube, skew_bend = vector.reshape(len(TWISTS), TWIST)
         return replace(self, pose=pose, blur=blur, skew=skew, bend=bend, cube=cube, skew_bend=skew_bend)
 
+    def exposed_only(self) -> FrameMotion | None:
+        """Return the motion during the exposure and the defocus, without pose and skew; None if still."""
+        if not (self.blur.any() or self.bend.any() or self.cube.any() or self.disc_px > 0.0):
+            return None
+        return replace(self, pose=_still(), skew=_still(), skew_bend=_still())
+
     @property
     def order(self) -> int:
         """Order of the path in time: 1 straight (or none), 2 quadratic, 3 cubic."""
         return 3 if self.cube.any() else 2 if self.bend.any() else 1
+
+
+def readout_of(motion: FrameMotion, camera: Camera, factor: float = 1.0) -> Readout:
+    """Return the pose and the skew of ``motion`` as the rolling shutter of the frame's ``camera``.
+
+    ``motion`` is in pixels of a frame that is 1 / ``factor`` times as large.
+    """
+    pixels = factor / camera.fx * np.array([motion.median_depth] * 3 + [1.0] * 3)
+    twists = pixels * np.stack([motion.pose, motion.skew, motion.skew_bend])
+    if motion.columns:
+        return Readout(twists, camera.fx / camera.width, camera.cx / camera.width - 0.5, True)
+    return Readout(twists, camera.fy / camera.height, camera.cy / camera.height - 0.5)
 
 
 def widened(camera: Camera, margin: int) -> Camera:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, margin_for
-from cleargs.formation.motion import widened
+from cleargs.formation.motion import readout_of, widened
 from cleargs.formation.warp import Warp, displacement_fields, linear_curve, srgb_curve
 from cleargs.splat.backend import backend_for, rasteriser_for
 from cleargs.splat.camera import Camera
@@ -26,6 +26,9 @@ from cleargs.splat.views import TrainingView
 class FormedView:
     """Implementation of `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
+    A rolling shutter is a part of the camera: each Gaussian is seen from the pose at which its row was read.
+    With ``still``, the render is that of a still camera, and `warp` has the skew too, to undo it.
+
     ``look`` receives each observed image with its render and margin, and returns the pixels that count: see
     `cleargs.formation.movement`.
     """
@@ -39,15 +42,21 @@ class FormedView:
     factor: float = 1.0
     mask: Tensor | None = None
     look: Callable[[Tensor, Render, int], Tensor | None] | None = None
+    still: bool = False
 
     def __post_init__(self) -> None:
-        """Widen the camera by the margin that the formation needs."""
+        """Widen the camera by the margin that the formation needs, and let its shutter roll."""
         self._frame_camera = self.camera
         self._margin = 0
-        if self.formation is not None:
+        self._motion = None if self.formation is None else self.formation.motion
+        if self._motion is not None and self._motion.skew.any() and not self.still:
+            readout = readout_of(self._motion, self._frame_camera, self.factor)
+            self.camera = replace(self.camera, readout=readout)
+            self._motion = self._motion.exposed_only()
+        if self.formation is not None and self._motion is not None:
             self._margin = margin_for(self.formation.reach_px * self.factor, self._frame_camera)
-            self.camera = widened(self._frame_camera, self._margin)
-        self.needs_depth = self.formation is not None or self.look is not None
+            self.camera = widened(self.camera, self._margin)
+        self.needs_depth = self._motion is not None or self.look is not None
 
     def forward(self, render: Render) -> Tensor:
         """Return the observed image [H, W, 3] sRGB of a render at ``camera``."""
@@ -56,7 +65,7 @@ class FormedView:
         if self.affine is not None:
             self._rendered = render.image
             image = backend.apply_affine(image, self.affine)
-        if self.formation is not None:
+        if self._motion is not None:
             self._warp = self.warp(render)
             linear, self._to_linear = backend.through_curve(image, linear_curve(device), CHANNELS)
             image, self._to_srgb = backend.through_curve(self._warp.forward(linear), srgb_curve(device), 3)
@@ -66,16 +75,16 @@ class FormedView:
 
     def warp(self, render: Render) -> Warp:
         """Return the operator B of the frame (`Warp`), from a render at ``camera`` with depth."""
-        assert self.formation is not None and render.depth is not None
+        assert self._motion is not None and render.depth is not None
         fields = displacement_fields(
-            self.formation.motion, self._frame_camera, render.depth, render.alpha, self._margin, self.factor
+            self._motion, self._frame_camera, render.depth, render.alpha, self._margin, self.factor
         )
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
         """Return the gradient by the render's image, from that by the observed image."""
         backend = backend_for(gradient.device)
-        if self.formation is not None:
+        if self._motion is not None:
             light = backend.times_slope(gradient, self._to_srgb, CHANNELS)
             gradient = backend.times_slope(self._warp.transpose(light), self._to_linear, 3)
         if self.affine is not None:

@@ -137,7 +137,7 @@ class SceneViewer:
             )
         if found.model == "none":
             return None
-        formed = FormedView(view.camera, 1.0, affine=affine, formation=found)
+        formed = FormedView(view.camera, 1.0, affine=affine, formation=found, still=True)
         return Deblurred(_deblurred(formed, self._with_depth(formed.camera), observed, mask), found)
 
     def formed_layers(self, view: TrainingView, factor: float = 1.0) -> dict[str, ImageF32]:
@@ -156,9 +156,14 @@ class SceneViewer:
             observed = np.asarray(cv2.resize(observed, size, interpolation=cv2.INTER_AREA))
             if mask is not None:
                 mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        formed = FormedView(camera, 1.0, affine=self._affine(view), formation=formation, factor=factor)
+        seen, formed = (
+            FormedView(
+                camera, 1.0, affine=self._affine(view), formation=formation, factor=factor, still=still
+            )
+            for still in (False, True)
+        )
+        explained = seen.forward(self._with_depth(seen.camera)).clamp(0.0, 1.0).cpu().numpy()
         render = self._with_depth(formed.camera)
-        explained = formed.forward(render).clamp(0.0, 1.0).cpu().numpy()
         return {"deblurred": _deblurred(formed, render, observed, mask), "explained": explained}
 
     def _affine(self, view: TrainingView) -> Tensor | None:

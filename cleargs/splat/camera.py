@@ -14,6 +14,26 @@ from cleargs.types import ArrayF64
 
 
 @dataclass(frozen=True, eq=False)
+class Readout:
+    """Motion of the scene past a camera while its rows are read one after the other.
+
+    At place s of the readout, from -1/2 to 1/2, the twist is ``twists[0] + s twists[1] + s² twists[2]``:
+    translation, then rotation vector, in the axes of the camera at the middle of the readout.
+    """
+
+    twists: npt.NDArray[np.float64]  # [3, 6] world units and radians
+    slope: float
+    start: float
+    """A pixel is read at the place slope * y/z + start, or at slope * x/z + start with ``columns``."""
+    columns: bool = False
+    """True if columns are read one after the other."""
+
+    def numbers(self) -> list[float]:
+        """Return all of it, to compare readouts."""
+        return [*self.twists.ravel().tolist(), self.slope, self.start, float(self.columns)]
+
+
+@dataclass(frozen=True, eq=False)
 class Camera:
     """An undistorted pinhole camera.
 
@@ -31,6 +51,8 @@ class Camera:
     cx: float
     cy: float
     world_to_camera: npt.NDArray[np.float64]  # [4, 4]
+    readout: Readout | None = None
+    """Rolling shutter of the camera; None: all rows are exposed at once."""
 
     def __post_init__(self) -> None:
         pose = np.ascontiguousarray(self.world_to_camera, dtype=np.float64)

@@ -435,7 +435,8 @@ def _over(cut_out: Tensor, alpha: Tensor, behind: Colour, affine: Tensor | None)
 
 
 def _numbers(camera: Camera) -> list[float]:
-    return [camera.width, camera.height, *view_numbers(camera)]
+    rolling = [] if camera.readout is None else camera.readout.numbers()
+    return [camera.width, camera.height, *view_numbers(camera), *rolling]
 
 
 def _next_save(begun: float, ended: float) -> float:
@@ -451,8 +452,7 @@ def _fingerprint(
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})
     seen = []
     for view in views:
-        *lens, pose = vars(view.camera).values()
-        seen.append((view.frame_id, view.kind, view.weight, view.time, [*lens, *pose.ravel().tolist()]))
+        seen.append((view.frame_id, view.kind, view.weight, view.time, _numbers(view.camera)))
     parts = [settings, seen, scene.antialias, scene.background, list(others)]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():

@@ -24,6 +24,7 @@ from helpers.warp_oracle import (
     random_image,
     scenery,
 )
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from cleargs.formation.motion import FrameMotion, pixel_paths
@@ -209,6 +210,28 @@ def test_a_depth_edge_moves_each_side_by_its_own_way() -> None:
     fields = displacement_fields(motion, CAMERA, depth, torch.ones_like(depth))
     np.testing.assert_allclose(fields.sweep[0, :, :100], -12.0)
     np.testing.assert_allclose(fields.sweep[0, :, 100:], -6.0)
+
+
+def test_a_long_skew_is_the_motion_of_a_slanted_wall() -> None:
+    """Rows see the wall from exact poses. A displacement of first order is up to 0.38 px off."""
+    motion = FrameMotion(skew=twist(9, -4, 3, 6, 14, 4), median_depth=MEDIAN)
+    normal, distance = np.array([0.5, 0.3, 1.0]), MEDIAN
+    row, column = np.indices((CAMERA.height, CAMERA.width)) + 0.5
+    rays = np.stack([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy, np.ones(row.shape)], -1)
+    depth = torch.from_numpy((distance / (rays @ normal)).astype(np.float32))
+    found = displacement_fields(motion, CAMERA, depth, torch.ones_like(depth)).offset.numpy()
+    lengths = np.array([MEDIAN] * 3 + [1.0] * 3) / CAMERA.fx
+    for line in range(9, CAMERA.height - 9, 9):
+        moved = ((line + 0.5) / CAMERA.height - 0.5) * motion.skew * lengths
+        turn = Rotation.from_rotvec(moved[3:]).as_matrix()
+        # Centre and rays of the camera at this row, in the axes of the still one.
+        origin, seen = -turn.T @ moved[:3], rays[line] @ turn
+        points = origin + seen * ((distance - origin @ normal) / (seen @ normal))[:, None]
+        places = points[:, :2] / points[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+        inside = ((places > 1) & (places < [CAMERA.width - 1, CAMERA.height - 1])).all(axis=1)
+        exact = places - np.stack([column[line], row[line]], 1)
+        off = np.linalg.norm(found[:, line].T - exact, axis=1)[inside]
+        assert off.max() < 0.1, (line, off.max())
 
 
 def test_floaters_do_not_move_by_whole_images() -> None:

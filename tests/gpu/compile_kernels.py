@@ -82,7 +82,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
         (
             frame_warp.displace,
             {**dict.fromkeys(("depth", "alpha", "motion"), F32), **FIELDS, **PHOTOGRAPH},
-            {"CURVED": True, "BLOCK": frame_warp.BLOCK},
+            {"READ_STEPS": 3, "CURVED": True, "BLOCK": frame_warp.BLOCK},
             {},
         ),
         (
@@ -130,6 +130,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                     **{
                         **SCENE,
                         "view": F64,
+                        "poses": F64,
                         "splats": F32,
                         "depth_keys": F32,
                         "tile_counts": I32,
@@ -137,7 +138,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                     },
                     **{"n": "i32", **SIZE},
                 },
-                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra},
+                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "ROLLS": extra},
                 UNFUSED,
             ),
             (
@@ -174,10 +175,10 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             (
                 gradients.backpropagate,
                 {
-                    **{**SCENE, "view": F64, "splats": F32, "tile_counts": I32, "totals": F64, **GRADIENTS},
-                    "n": "i32",
+                    **{**SCENE, "view": F64, "poses": F64, "splats": F32, "tile_counts": I32, "totals": F64},
+                    **{**GRADIENTS, "n": "i32"},
                 },
-                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "HAS_DEPTH": extra},
+                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "HAS_DEPTH": extra, "ROLLS": extra},
                 {},
             ),
         ]

@@ -17,6 +17,7 @@ from cleargs.splat.constants import SH_DEGREES, VIEW_CLAMP
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.support import available_memory
 from cleargs.splat.kernels.splat_layout import MAX_PAIRS, TILE
+from cleargs.splat.rolling import own_poses
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 
@@ -96,6 +97,8 @@ class ForwardPass:
     camera: Camera
     sh_count: int
     antialias: bool
+    own_poses: Tensor | None
+    """Pose of each Gaussian with a rolling shutter, [N, 12]: see `cleargs.splat.rolling`."""
 
 
 class Rasteriser(ABC):
@@ -141,7 +144,13 @@ class Rasteriser(ABC):
                 f"the kernels need float32 parameters, but these are {gaussians.means.dtype}",
                 hint="convert each of the five parameters with .float()",
             )
-        inputs = ForwardPass(gaussians.detach(), camera, sh_count(gaussians, sh_degree), antialias)
+        inputs = ForwardPass(
+            gaussians.detach(),
+            camera,
+            sh_count(gaussians, sh_degree),
+            antialias,
+            own_poses(gaussians.means, camera),
+        )
         with self._launching():
             self._state = self._bin(inputs, background, depth)
             return self._blend(self._state, depth)
@@ -171,7 +180,8 @@ class Rasteriser(ABC):
 
         Raises:
             RuntimeError: There was no ``forward`` before.
-            ValueError: ``grad_image`` does not have the shape of the image.
+            ValueError: ``grad_image`` does not have the shape of the image, or ``grad_depth`` is given for a
+                camera whose shutter rolls.
         """
         if self._state is None:
             raise RuntimeError("backward() needs a call of forward() before it")
@@ -179,6 +189,8 @@ class Rasteriser(ABC):
         expected = (camera.height, camera.width, 3)
         if tuple(grad_image.shape) != expected:
             raise ValueError(f"grad_image has the shape {tuple(grad_image.shape)}, expected {expected}")
+        if grad_depth is not None and camera.readout is not None:
+            raise ValueError("the depth of a camera whose shutter rolls has no gradient")
         with self._launching():
             return self._differentiate(
                 self._state,

@@ -20,6 +20,11 @@ MIN_COVERED = 0.5
 MAX_NEARNESS = 4.0
 """Upper limit of a pixel's nearness (median depth / depth), which bounds the motion of nearby floaters."""
 
+READ_STEPS = 3
+"""Times that the displacement by a rolling shutter is computed again, from the middle of its path and the
+nearness at its end. The number is odd: where a pixel sees what the still image hides, the nearness alternates
+between that in front and that behind, and from the one in front the pixel gets the colour behind."""
+
 # A frame's motion as the kernels read it: a row of float32, lengths in pixels of the observed image.
 FX = 0
 FY = 1
@@ -31,6 +36,7 @@ FOCUS = 6  # nearness that is in focus
 READ_ACROSS = 7  # 1 if columns are read one after the other, else 0
 READ_DOWN = 8  # 1 if rows are
 TWISTS = 9  # pose, blur, skew, skew_bend, bend and cube: translation and rotation, six numbers each
+SKEW = slice(21, 27)  # numbers of skew; zero with a global shutter
 CURVES = 33  # first number of bend; bend and cube are zero on a straight path
 MOTION_COLUMNS = 45
 

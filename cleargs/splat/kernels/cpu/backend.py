@@ -225,6 +225,16 @@ def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
     return out
 
 
+def read_displacements(
+    depth: ArrayF32, alpha: ArrayF32, lens: ArrayF32, twists: ArrayF32, down: ArrayF32, across: ArrayF32
+) -> ArrayF32:
+    """Return the displacements [2, H, W], px, by a rolling shutter: see `frame_warp.read_displacements`."""
+    out = np.empty((2, *depth.shape), np.float32)
+    with LAUNCHING:
+        frame_warp.read_displacements(depth, alpha, lens, twists, down, across, out)
+    return out
+
+
 def flow(basis: ArrayF32, twist: npt.NDArray[np.float64]) -> ArrayF32:
     """Return the image motion [2, H, W], px, of a ``twist`` [6]: see `frame_search.flow`."""
     out = np.empty(basis.shape[1:], np.float32)

@@ -171,6 +171,70 @@ def _flow(x: Any, y: Any, near: Any, twist: Any) -> tuple[Any, Any]:
     return along_x, along_y
 
 
+@inlined
+def _nearness(depth: Any, alpha: Any, row: Any, column: Any, median: Any) -> Any:
+    """Return the median depth over the depth of a pixel; 1 where it has none."""
+    covered, behind = alpha[row, column], depth[row, column]
+    if covered > np.float32(layout.MIN_COVERED) and behind > _ZERO:  # false for NaN
+        return min(median * covered / behind, np.float32(layout.MAX_NEARNESS))
+    return _ONE
+
+
+@inlined
+def _read_flow(row: Any, column: Any, x: Any, y: Any, depth: Any, alpha: Any, lens: Any, twist: Any) -> Any:
+    """Return the displacement, px, of a pixel (``row``, ``column`` of ``depth``) under a long ``twist``.
+
+    It is the second-order solution (midpoint rule) of the motion along the path, with the nearness of the
+    point that the pixel sees.
+    """
+    rows, columns = depth.shape
+    fx, ratio, median = lens[layout.FX], lens[layout.FY] / lens[layout.FX], lens[layout.MEDIAN]
+    along_x, along_y = _flow(x, y, _nearness(depth, alpha, row, column, median), twist)
+    half = _HALF / fx
+    for _ in range(layout.READ_STEPS):
+        down = min(max(np.float32(row) + along_y * ratio + _HALF, _ZERO), np.float32(rows - 1))
+        across = min(max(np.float32(column) + along_x + _HALF, _ZERO), np.float32(columns - 1))
+        near = _nearness(depth, alpha, np.int64(down), np.int64(across), median)
+        along_x, along_y = _flow(x + half * along_x, y + half * along_y, near, twist)
+    return along_x, along_y * ratio
+
+
+@kernel
+def read_displacements(
+    depth: ArrayF32,  # [H, W] accumulated
+    alpha: ArrayF32,  # [H, W]
+    lens: ArrayF32,  # the first numbers of a motion: see `warp_layout`
+    twists: ArrayF32,  # [3, 6] pose, skew, skew_bend
+    down: ArrayF32,  # [H] places of the rows within the readout, -1/2 to 1/2; zeros if columns are read
+    across: ArrayF32,  # [W] likewise of the columns
+    offset: ArrayF32,  # [2, H, W] written
+) -> None:
+    """Compute the displacements, px, of all pixels by the readout alone."""
+    height, width = depth.shape
+    for row in prange(height):
+        y = (np.float32(row) + _HALF - lens[layout.CY]) / lens[layout.FY]
+        for column in range(width):
+            x = (np.float32(column) + _HALF - lens[layout.CX]) / lens[layout.FX]
+            twist = _at_readout(twists[0], twists[1], twists[2], down[row] + across[column])
+            along_x, along_y = _read_flow(row, column, x, y, depth, alpha, lens, twist)
+            offset[0, row, column] = along_x
+            offset[1, row, column] = along_y
+
+
+@inlined
+def _at_readout(pose: Any, skew: Any, skew_bend: Any, read: Any) -> Any:  # [6] each -> 6 float32
+    """Return the twist of a pixel that is read at ``read``, from -1/2 to 1/2."""
+    again = read * read
+    return (
+        pose[0] + read * skew[0] + again * skew_bend[0],
+        pose[1] + read * skew[1] + again * skew_bend[1],
+        pose[2] + read * skew[2] + again * skew_bend[2],
+        pose[3] + read * skew[3] + again * skew_bend[3],
+        pose[4] + read * skew[4] + again * skew_bend[4],
+        pose[5] + read * skew[5] + again * skew_bend[5],
+    )
+
+
 @kernel
 def displacements(
     depth: ArrayF32,  # [H + 2 margin, W + 2 margin] accumulated
@@ -192,33 +256,28 @@ def displacements(
     _, height, width = offset.shape
     fx, fy, cx, cy = motion[layout.FX], motion[layout.FY], motion[layout.CX], motion[layout.CY]
     twists = motion[layout.TWISTS :].reshape(6, 6)
+    rolls = np.any(motion[layout.SKEW] != _ZERO)
     for row in prange(height):
         down = motion[layout.READ_DOWN] * np.float32((row + 0.5) / height - 0.5)
-        y = (np.float32(row) + np.float32(0.5) - cy) / fy
+        y = (np.float32(row) + _HALF - cy) / fy
         farthest = 0.0
         for column in range(width):
-            x = (np.float32(column) + np.float32(0.5) - cx) / fx
-            covered = alpha[row + margin, column + margin]
-            behind = depth[row + margin, column + margin]
-            near = _ONE
-            if covered > np.float32(layout.MIN_COVERED) and behind > _ZERO:  # false for NaN
-                near = min(motion[layout.MEDIAN] * covered / behind, np.float32(layout.MAX_NEARNESS))
-            for part in range(2):
-                # Pose and skew give the offset, blur gives the sweep.
-                tx, ty, tz, rx, ry, rz = _twist(twists, part)
-                if part == 0:
-                    read = down + motion[layout.READ_ACROSS] * np.float32((column + 0.5) / width - 0.5)
-                    again = read * read
-                    tx += read * twists[2, 0] + again * twists[3, 0]
-                    ty += read * twists[2, 1] + again * twists[3, 1]
-                    tz += read * twists[2, 2] + again * twists[3, 2]
-                    rx += read * twists[2, 3] + again * twists[3, 3]
-                    ry += read * twists[2, 4] + again * twists[3, 4]
-                    rz += read * twists[2, 5] + again * twists[3, 5]
-                field = offset if part == 0 else sweep
-                along_x, along_y = _flow(x, y, near, (tx, ty, tz, rx, ry, rz))
-                field[0, row, column] = along_x
-                field[1, row, column] = along_y * (fy / fx)
+            x = (np.float32(column) + _HALF - cx) / fx
+            near = _nearness(depth, alpha, row + margin, column + margin, motion[layout.MEDIAN])
+            if rolls:
+                read = down + motion[layout.READ_ACROSS] * np.float32((column + 0.5) / width - 0.5)
+                moved = _at_readout(twists[0], twists[2], twists[3], read)
+                along_x, along_y = _read_flow(
+                    row + margin, column + margin, x, y, depth, alpha, motion, moved
+                )
+            else:
+                along_x, along_y = _flow(x, y, near, _twist(twists, 0))
+                along_y *= fy / fx
+            offset[0, row, column] = along_x
+            offset[1, row, column] = along_y
+            along_x, along_y = _flow(x, y, near, _twist(twists, 1))
+            sweep[0, row, column] = along_x
+            sweep[1, row, column] = along_y * (fy / fx)
             radius[row, column] = motion[layout.DISC] * abs(near - motion[layout.FOCUS])
             vertical = abs(offset[1, row, column]) + np.float32(0.5) * abs(sweep[1, row, column])
             if curve is not None:

@@ -26,6 +26,7 @@ from cleargs.splat.kernels.cpu.projection import (
     direction_to,
     dot,
     mixed,
+    own_view,
     projection_rows,
     residual,
     scaled_axes,
@@ -186,6 +187,7 @@ def backpropagate(
     parameters: Parameters,
     sh_count: int,
     view: ProjectionView,
+    poses: AnyArray | None,  # [N, 12], see `own_view`
     antialias: bool,
     splats: ArrayF32,  # [N, 16]
     pair_offsets: AnyArray,  # [N + 1]
@@ -216,4 +218,5 @@ def backpropagate(
             for pair in range(begin, end):
                 for column in range(pair_sums.shape[1]):
                     sums[column] += pair_sums[pair, column]
-            backpropagate_one(g, parameters, sh_count, view, antialias, splats, sums, outputs, basis, weights)
+            own = own_view(g, view, poses)
+            backpropagate_one(g, parameters, sh_count, own, antialias, splats, sums, outputs, basis, weights)

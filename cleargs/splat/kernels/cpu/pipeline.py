@@ -43,6 +43,10 @@ def read_parameters(gaussians: Gaussians) -> projection.Parameters:
     return tuple(tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values())
 
 
+def _poses(inputs: rasteriser.ForwardPass) -> AnyArray | None:
+    return None if inputs.own_poses is None else inputs.own_poses.numpy()
+
+
 class CpuRasteriser(rasteriser.Rasteriser):
     """The rasteriser on the CPU."""
 
@@ -74,7 +78,8 @@ class CpuRasteriser(rasteriser.Rasteriser):
         tile_counts = self._integers("tile_counts", n)
         radii = self._floats("radii", n)
         projection.project(
-            *(read_parameters(gaussians), inputs.sh_count, view, inputs.antialias, width, height),
+            *(read_parameters(gaussians), inputs.sh_count, view, _poses(inputs), inputs.antialias),
+            *(width, height),
             *(splats, tile_counts, radii),
         )
         self.radii = torch.from_numpy(radii)
@@ -141,7 +146,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
         parameters = state.gaussians.tensors()
         outputs = {name: self._floats(f"grad_{name}", *value.shape) for name, value in parameters.items()}
         gradients.backpropagate(
-            *(read_parameters(state.gaussians), state.sh_count, state.view, state.antialias),
+            *(read_parameters(state.gaussians), state.sh_count, state.view, _poses(state), state.antialias),
             *(state.splats, state.pair_offsets, pair_sums, tuple(outputs.values())),
         )
         return Gaussians(**{name: torch.from_numpy(output) for name, output in outputs.items()})

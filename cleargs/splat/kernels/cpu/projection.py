@@ -84,6 +84,19 @@ class ProjectionView(NamedTuple):
 
 
 @device
+def own_view(g: int, view: ProjectionView, poses: AnyArray | None) -> ProjectionView:
+    """Return the view of Gaussian ``g``, by its row of ``poses`` [N, 12] with a rolling shutter."""
+    if poses is None:
+        return view
+    p = poses[g]
+    return ProjectionView(
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11],
+        view.centre_x, view.centre_y, view.centre_z, view.fx, view.fy, view.cx, view.cy,
+        view.left, view.right, view.top, view.bottom,
+    )  # fmt: skip
+
+
+@device
 def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -233,6 +246,7 @@ def project(
     parameters: Parameters,
     sh_count: int,
     view: ProjectionView,
+    poses: AnyArray | None,  # [N, 12], see `own_view`
     antialias: bool,
     width: int,
     height: int,
@@ -249,7 +263,9 @@ def project(
         basis = np.empty(16, np.float32)
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             tiles = 0
-            if project_one(g, parameters, sh_count, view, antialias, splats, basis):
+            if project_one(g, parameters, sh_count, own_view(g, view, poses), antialias, splats, basis):
                 tiles = count_tiles(splats[g], width, height)
+                if poses is not None:  # different poses would mix the order of Gaussians on one surface
+                    splats[g, layout.DEPTH] = max(camera_position(parameters[0][g], view)[2], NEAR)
             tile_counts[g] = tiles
             radii[g] = max(splats[g, layout.EXTENT_X], splats[g, layout.EXTENT_Y]) if tiles > 0 else ZERO

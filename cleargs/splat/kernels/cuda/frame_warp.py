@@ -43,6 +43,33 @@ def flow(x, y, near, twist):
     return along_x, along_y
 
 
+@triton.jit
+def nearness(depth, alpha, at, inside, median):
+    """Return the median depth over the depths of the pixels ``at``; 1 where they have none."""
+    covered = tl.load(alpha + at, mask=inside, other=0.0)
+    behind = tl.load(depth + at, mask=inside, other=0.0)
+    seen = (covered > layout.MIN_COVERED) & (behind > 0.0)  # false for NaN
+    return tl.where(
+        seen, tl.minimum(median * covered / tl.where(seen, behind, 1.0), layout.MAX_NEARNESS), 1.0
+    )
+
+
+@triton.jit
+def twist_at(motion, read):
+    """Return the twist of pixels that are read at ``read``, from -1/2 to 1/2: pose and skew."""
+    px, py, pz, qx, qy, qz = twist_of(motion, 0)
+    tx, ty, tz, rx, ry, rz = twist_of(motion, 2)
+    ux, uy, uz, vx, vy, vz = twist_of(motion, 3)
+    return (
+        px + read * (tx + read * ux),
+        py + read * (ty + read * uy),
+        pz + read * (tz + read * uz),
+        qx + read * (rx + read * vx),
+        qy + read * (ry + read * vy),
+        qz + read * (rz + read * vz),
+    )
+
+
 @triton.jit(do_not_specialize=["height", "width", "margin"])
 def displace(
     depth,
@@ -55,23 +82,21 @@ def displace(
     height,
     width,
     margin,
+    READ_STEPS: tl.constexpr,
     CURVED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Store the fields of a frame's motion and defocus; depth, alpha [H + 2 margin, W + 2 margin].
 
-    ``curve`` is written where ``CURVED``.
+    ``curve`` is written where ``CURVED``. ``READ_STEPS`` is that of ``warp_layout``; 0: a global shutter.
     """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane = height * width
     inside = pixel < plane
     row, column = pixel // width, pixel % width
-    at = (row + margin) * (width + 2 * margin) + column + margin
-    covered = tl.load(alpha + at, mask=inside, other=0.0)
-    behind = tl.load(depth + at, mask=inside, other=0.0)
-    seen = (covered > layout.MIN_COVERED) & (behind > 0.0)  # false for NaN
-    near = tl.load(motion + layout.MEDIAN) * covered / tl.where(seen, behind, 1.0)
-    near = tl.where(seen, tl.minimum(near, layout.MAX_NEARNESS), 1.0)
+    rows, columns = height + 2 * margin, width + 2 * margin
+    median = tl.load(motion + layout.MEDIAN)
+    near = nearness(depth, alpha, (row + margin) * columns + column + margin, inside, median)
     fx, fy = tl.load(motion + layout.FX), tl.load(motion + layout.FY)
     x = (column.to(tl.float32) + 0.5 - tl.load(motion + layout.CX)) / fx
     y = (row.to(tl.float32) + 0.5 - tl.load(motion + layout.CY)) / fy
@@ -79,12 +104,17 @@ def displace(
     across = (column.to(tl.float32) + 0.5) / width - 0.5
     read = tl.load(motion + layout.READ_DOWN) * down + tl.load(motion + layout.READ_ACROSS) * across
     # Pose and skew give the offset, blur gives the sweep.
-    pose_x, pose_y = flow(x, y, near, twist_of(motion, 0))
-    skew_x, skew_y = flow(x, y, near, twist_of(motion, 2))
-    bend_x, bend_y = flow(x, y, near, twist_of(motion, 3))
-    skew_x, skew_y = skew_x + read * bend_x, skew_y + read * bend_y
-    tl.store(offset + pixel, pose_x + read * skew_x, mask=inside)
-    tl.store(offset + plane + pixel, (pose_y + read * skew_y) * (fy / fx), mask=inside)
+    moved = twist_at(motion, read)
+    offset_x, offset_y = flow(x, y, near, moved)
+    for _ in tl.static_range(READ_STEPS):
+        lower = row.to(tl.float32) + margin + offset_y * (fy / fx) + 0.5
+        right = column.to(tl.float32) + margin + offset_x + 0.5
+        lower = tl.minimum(tl.maximum(lower, 0.0), (rows - 1).to(tl.float32)).to(tl.int32)
+        right = tl.minimum(tl.maximum(right, 0.0), (columns - 1).to(tl.float32)).to(tl.int32)
+        there = nearness(depth, alpha, lower * columns + right, inside, median)
+        offset_x, offset_y = flow(x + 0.5 * offset_x / fx, y + 0.5 * offset_y / fx, there, moved)
+    tl.store(offset + pixel, offset_x, mask=inside)
+    tl.store(offset + plane + pixel, offset_y * (fy / fx), mask=inside)
     blur_x, blur_y = flow(x, y, near, twist_of(motion, 1))
     tl.store(sweep + pixel, blur_x, mask=inside)
     tl.store(sweep + plane + pixel, blur_y * (fy / fx), mask=inside)
@@ -278,6 +308,7 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
         alpha.contiguous(),
         motion.to(depth.device, non_blocking=True),  # read before the call returns
         *(*_planes(fields), height, width, margin),
+        READ_STEPS=layout.READ_STEPS if motion[layout.SKEW].any() else 0,
         CURVED=curve is not None,
         BLOCK=BLOCK,
         num_warps=4,

@@ -18,6 +18,7 @@ from cleargs.splat.kernels.cuda.projection import (
     cross,
     dot,
     load_triple,
+    pose_of,
     projection_rows,
     rotation_columns,
     scaled,
@@ -78,6 +79,7 @@ def backpropagate(
     logits,
     sh,
     view,
+    poses,
     splats,
     tile_counts,
     totals,
@@ -91,6 +93,7 @@ def backpropagate(
     SH_COUNT: tl.constexpr,
     ANTIALIAS: tl.constexpr,
     HAS_DEPTH: tl.constexpr,
+    ROLLS: tl.constexpr,
 ):
     """Store the gradients of the five parameters. They are exactly 0 for a Gaussian that touches no tile."""
     g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
@@ -98,7 +101,8 @@ def backpropagate(
     some = mask & (tl.load(tile_counts + g, mask=mask, other=0) > 0)
     sum_v = sum_of(totals, layout.SUM_V, g, n, some)
     mean = load_triple(means + g * 3, some)
-    position = camera_position(mean, view)
+    pose = pose_of(view, poses, g, some, ROLLS)
+    position = camera_position(mean, pose)
     x, y = position[0], position[1]
     z = tl.where(some, position[2], 1.0)
     position = (x, y, z)
@@ -107,7 +111,7 @@ def backpropagate(
     scales = load_triple(log_scales + g * 3, some)
     sx, sy, sz = tl.exp(scales[0]), tl.exp(scales[1]), tl.exp(scales[2])
     axis0, axis1, axis2 = scaled(sx, columns[0]), scaled(sy, columns[1]), scaled(sz, columns[2])
-    rows = projection_rows(position, view)
+    rows = projection_rows(position, view, pose)
     row0, row1, bounded_x, bounded_y = rows[0], rows[1], rows[2], rows[3]
     u0 = (dot(row0, axis0), dot(row0, axis1), dot(row0, axis2))
     u1 = (dot(row1, axis0), dot(row1, axis1), dot(row1, axis2))
@@ -161,9 +165,7 @@ def backpropagate(
     # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 is analogous
     r0 = combine(1.0, combine(v0[0], axis0, v0[1], axis1), v0[2], axis2)
     r1 = combine(1.0, combine(v1[0], axis0, v1[1], axis1), v1[2], axis2)
-    w0 = view_triple(view, device_layout.VIEW_ROTATION)
-    w1 = view_triple(view, device_layout.VIEW_ROTATION + 3)
-    w2 = view_triple(view, device_layout.VIEW_ROTATION + 6)
+    w0, w1, w2 = pose[0], pose[1], pose[2]
     grad_jx, grad_jxz, grad_jy, grad_jyz = dot(r0, w0), dot(r0, w2), dot(r1, w1), dot(r1, w2)
     fx, fy = tl.load(view + device_layout.VIEW_FX), tl.load(view + device_layout.VIEW_FY)
     jx, jy, tangent_x, tangent_y = fx / z, fy / z, x / z, y / z

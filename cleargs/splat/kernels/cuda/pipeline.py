@@ -55,6 +55,11 @@ class CudaForwardPass(rasteriser.ForwardPass):
     last: Tensor  # [H, W] int32
 
 
+def _poses(inputs: rasteriser.ForwardPass, view: Tensor) -> Tensor:
+    """Return the Gaussians' own poses; without a rolling shutter a tensor that the kernels do not read."""
+    return view if inputs.own_poses is None else inputs.own_poses
+
+
 class CudaRasteriser(rasteriser.Rasteriser):
     """Forward and backward passes on a GPU, or on the CPU in Triton's interpreter."""
 
@@ -119,11 +124,13 @@ class CudaRasteriser(rasteriser.Rasteriser):
             )
             gradients.backpropagate[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in parameters.values()),
-                *(state.view, state.splats, state.tile_counts, totals, *outputs.values(), n),
+                *(state.view, _poses(state, state.view), state.splats, state.tile_counts, totals),
+                *(*outputs.values(), n),
                 SH_STORED=state.gaussians.sh.shape[1],
                 SH_COUNT=state.sh_count,
                 ANTIALIAS=state.antialias,
                 HAS_DEPTH=grad_depth is not None,
+                ROLLS=state.own_poses is not None,
                 num_warps=4,
             )
         return Gaussians(**outputs)
@@ -143,10 +150,11 @@ class CudaRasteriser(rasteriser.Rasteriser):
         if n:
             projection.project[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in gaussians.tensors().values()),
-                *(view, splats, depth_keys, tile_counts, self.radii, n, width, height),
+                *(view, _poses(inputs, view), splats, depth_keys, tile_counts, self.radii, n, width, height),
                 SH_STORED=gaussians.sh.shape[1],
                 SH_COUNT=inputs.sh_count,
                 ANTIALIAS=inputs.antialias,
+                ROLLS=inputs.own_poses is not None,
                 num_warps=4,
                 enable_fp_fusion=False,
             )

@@ -58,14 +58,40 @@ def view_triple(view, at: tl.constexpr):
 
 
 @triton.jit
-def camera_position(mean, view):
-    """Return the Gaussian's centre in camera coordinates."""
-    shift = view_triple(view, device_layout.VIEW_TRANSLATION)
+def pose_of(view, poses, g, mask, ROLLS: tl.constexpr):
+    """Return the rows of the rotation and the shift: of the view, or with ``ROLLS`` of each Gaussian."""
+    if ROLLS:
+        first = poses + g * 12
+        return (
+            load_row(first, mask),
+            load_row(first + 3, mask),
+            load_row(first + 6, mask),
+            load_row(first + 9, mask),
+        )
+    else:
+        return (
+            view_triple(view, device_layout.VIEW_ROTATION),
+            view_triple(view, device_layout.VIEW_ROTATION + 3),
+            view_triple(view, device_layout.VIEW_ROTATION + 6),
+            view_triple(view, device_layout.VIEW_TRANSLATION),
+        )
+
+
+@triton.jit
+def load_row(pointer, mask):
+    """Return three consecutive float64 per Gaussian."""
     return (
-        dot(view_triple(view, device_layout.VIEW_ROTATION), mean) + shift[0],
-        dot(view_triple(view, device_layout.VIEW_ROTATION + 3), mean) + shift[1],
-        dot(view_triple(view, device_layout.VIEW_ROTATION + 6), mean) + shift[2],
+        tl.load(pointer, mask=mask, other=0.0),
+        tl.load(pointer + 1, mask=mask, other=0.0),
+        tl.load(pointer + 2, mask=mask, other=0.0),
     )
+
+
+@triton.jit
+def camera_position(mean, pose):
+    """Return the Gaussian's centre in camera coordinates."""
+    shift = pose[3]
+    return (dot(pose[0], mean) + shift[0], dot(pose[1], mean) + shift[1], dot(pose[2], mean) + shift[2])
 
 
 @triton.jit
@@ -93,7 +119,7 @@ def rotation_columns(q):
 
 
 @triton.jit
-def projection_rows(position, view):
+def projection_rows(position, view, pose):
     """Return the rows of J W, and the bounded x/z and y/z of J."""
     x, y, z = position[0], position[1], position[2]
     jx, jy = tl.load(view + device_layout.VIEW_FX) / z, tl.load(view + device_layout.VIEW_FY) / z
@@ -101,9 +127,8 @@ def projection_rows(position, view):
     top, bottom = tl.load(view + device_layout.VIEW_TOP), tl.load(view + device_layout.VIEW_BOTTOM)
     tangent_x = tl.minimum(tl.maximum(x / z, left), right)
     tangent_y = tl.minimum(tl.maximum(y / z, top), bottom)
-    forwards = view_triple(view, device_layout.VIEW_ROTATION + 6)
-    row0 = combine(jx, view_triple(view, device_layout.VIEW_ROTATION), -jx * tangent_x, forwards)
-    row1 = combine(jy, view_triple(view, device_layout.VIEW_ROTATION + 3), -jy * tangent_y, forwards)
+    row0 = combine(jx, pose[0], -jx * tangent_x, pose[2])
+    row1 = combine(jy, pose[1], -jy * tangent_y, pose[2])
     return (row0, row1, tangent_x, tangent_y)
 
 
@@ -121,6 +146,7 @@ def project(
     logits,
     sh,
     view,
+    poses,
     splats,
     depth_keys,
     tile_counts,
@@ -131,6 +157,7 @@ def project(
     SH_STORED: tl.constexpr,
     SH_COUNT: tl.constexpr,
     ANTIALIAS: tl.constexpr,
+    ROLLS: tl.constexpr,
 ):
     """Store packed splats [N, 16], depth keys [N], numbers of touched tiles [N] int32 and radii [N] in px.
 
@@ -141,7 +168,8 @@ def project(
     g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
     mask = g < n
     mean = load_triple(means + g * 3, mask)
-    position = camera_position(mean, view)
+    pose = pose_of(view, poses, g, mask, ROLLS)
+    position = camera_position(mean, pose)
     z = position[2]
     visible = mask & (z >= constants.NEAR) & (z <= device_layout.FLOAT32_MAX)
     # Culled lanes continue with harmless numbers.
@@ -151,7 +179,7 @@ def project(
     axes = rotation_columns(quaternion)
     scales = load_triple(log_scales + g * 3, mask)
     sx, sy, sz = tl.exp(scales[0]), tl.exp(scales[1]), tl.exp(scales[2])
-    rows = projection_rows(position, view)
+    rows = projection_rows(position, view, pose)
     u0 = (dot(rows[0], axes[0]) * sx, dot(rows[0], axes[1]) * sy, dot(rows[0], axes[2]) * sz)
     u1 = (dot(rows[1], axes[0]) * sx, dot(rows[1], axes[1]) * sy, dot(rows[1], axes[2]) * sz)
     xx, xy, yy = dot(u0, u0) + constants.DILATION, dot(u0, u1), dot(u1, u1) + constants.DILATION
@@ -205,6 +233,9 @@ def project(
     tl.store(row + layout.RED, tl.maximum(red + constants.SH_OFFSET, 0.0), mask=visible)
     tl.store(row + layout.GREEN, tl.maximum(green + constants.SH_OFFSET, 0.0), mask=visible)
     tl.store(row + layout.BLUE, tl.maximum(blue + constants.SH_OFFSET, 0.0), mask=visible)
+    if ROLLS:  # different poses would mix the order of Gaussians on one surface
+        still = camera_position(mean, pose_of(view, poses, g, mask, False))
+        z = tl.maximum(still[2], constants.NEAR)
     tl.store(row + layout.DEPTH, z.to(tl.float32), mask=visible)
     tl.store(row + layout.EXTENT_X, extent_x, mask=visible)
     tl.store(row + layout.EXTENT_Y, extent_y, mask=visible)
