@@ -19,6 +19,7 @@ from cleargs.splat.kernels.cuda.self_test import Sizes, View
 SMALL = Sizes(
     views={
         "a small view": View(20, 18, 17, 3.0, all_outputs=True),
+        "a rolling shutter": View(25, 20, 16, 3.0, rolls=True),
         "long tile lists": View(150, 16, 16, 6.0, faint=True),
         "a large view": View(150, 40, 20, 2.0),
     },

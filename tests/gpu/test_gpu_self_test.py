@@ -34,7 +34,7 @@ def in_child(fault: str, **options: Any) -> SelfTest:
 def test_the_interpreter_passes(cache: Path) -> None:
     tested = in_child("pass")
     assert tested.fault is None, tested.lines()
-    assert len(tested.checks) == 8
+    assert len(tested.checks) == 9
     assert all(check.seconds for check in tested.checks)
     assert gpu.cached_test(FACTS) == tested
     assert gpu.cached_test({**FACTS, "driver": "another"}) is None

@@ -9,14 +9,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from cleargs.splat.backend import Backend
-from cleargs.splat.camera import Camera
+from cleargs.splat.camera import Camera, Readout
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import warp_layout
 from cleargs.splat.kernels.cuda.support import gpu_fault
@@ -35,12 +37,19 @@ class View(NamedTuple):
     """True: opacities near 0.02, so that a ray passes hundreds of Gaussians."""
     all_outputs: bool = False
     """True: with anti-aliasing, depth, gradients of alpha and depth, and SH of degree 1 instead of 3."""
+    rolls: bool = False
+    """True: the shutter of the camera rolls, with a skew of a tenth of the height."""
 
     def scene(self, device: torch.device) -> tuple[Gaussians, Camera]:
         """Return the Gaussians on ``device``, and the camera."""
         gaussians, camera = random_scene(self.gaussians, self.width, self.height, sigma=self.sigma)
         if self.faint:
             gaussians.logit_opacities -= gaussians.logit_opacities.mean() + 4.0
+        if self.rolls:
+            skew = 0.1 * camera.height / camera.fx
+            twists = skew * np.array([[0.0] * 6, [0.5, -0.3, 0.2, 0.6, 0.8, 0.5], [0.1] * 6])
+            readout = Readout(twists, camera.fy / camera.height, camera.cy / camera.height - 0.5)
+            camera = replace(camera, readout=readout)
         return gaussians.to(device), camera
 
 
@@ -60,6 +69,7 @@ class Sizes(NamedTuple):
 FULL = Sizes(
     {
         "rendering a small view": View(300, 61, 47, 4.0, all_outputs=True),
+        "rendering with a rolling shutter": View(3_000, 160, 120, 3.0, rolls=True),
         "rendering long tile lists": View(4_000, 48, 32, 8.0, faint=True),
         # The numbers of 33,124 tiles do not fit in 16 bits. 200,000 Gaussians fill many blocks.
         "rendering a large view": View(200_000, 2912, 2912, 3.0),
