@@ -307,7 +307,9 @@ def test_a_folder_of_videos_is_one_capture(tmp_path: Path, ingest: Ingest) -> No
 
 
 def test_videos_of_one_stem_keep_names_of_their_own(tmp_path: Path) -> None:
-    clip(tmp_path / "a.mp4"), clip(tmp_path / "a.mkv")
+    for place in ("one", "two"):  # in one folder, the smaller one would be a copy in another format
+        (tmp_path / place).mkdir()
+        clip(tmp_path / place / "a.mp4")
     names = [frame.name for frame in open_capture(tmp_path, IngestConfig()).frames]
     assert len(names) == len(set(names)) == 60
 

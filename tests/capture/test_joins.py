@@ -123,8 +123,8 @@ def test_a_join_that_stays_wrong_is_named(
 ) -> None:
     run = sfm._run
 
-    def torn(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
-        model, outcome = run(job, reporter)
+    def torn(job: Job, reporter: Reporter, *known: object) -> tuple[SparseModel, SfmOutcome]:
+        model, outcome = run(job, reporter, None)
         return model, outcome.model_copy(update={"torn_at": 3})
 
     assert not any("another scale" in text for text in ingest(images).warnings)

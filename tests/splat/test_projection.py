@@ -75,7 +75,16 @@ def project(gaussians, camera, antialias=False):
     arrays = [tensor.numpy() for tensor in gaussians.tensors().values()]
     view = projection.ProjectionView(*view_numbers(camera))
     projection.project(
-        tuple(arrays), 16, view, None, antialias, camera.width, camera.height, splats, tiles, radii
+        tuple(arrays),
+        16,
+        view,
+        np.empty((0, 12)),
+        antialias,
+        camera.width,
+        camera.height,
+        splats,
+        tiles,
+        radii,
     )
     return splats, tiles, radii
 

@@ -149,7 +149,7 @@ class Rasteriser(ABC):
             camera,
             sh_count(gaussians, sh_degree),
             antialias,
-            own_poses(gaussians.means, camera),
+            self._own_poses(gaussians.means, camera),
         )
         with self._launching():
             self._state = self._bin(inputs, background, depth)
@@ -198,6 +198,10 @@ class Rasteriser(ABC):
                 None if grad_alpha is None else grad_alpha.detach().contiguous(),
                 None if grad_depth is None else grad_depth.detach().contiguous(),
             )
+
+    def _own_poses(self, means: Tensor, camera: Camera) -> Tensor | None:
+        """Return the pose of the camera for each Gaussian: see `cleargs.splat.rolling`."""
+        return own_poses(means, camera)
 
     @abstractmethod
     def _launching(self) -> AbstractContextManager[Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cleargs.splat import densification
-from cleargs.splat.camera import Camera
+from cleargs.splat.camera import Camera, Readout
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import blur_sums as blur_kernels
@@ -329,6 +330,7 @@ def warm_up() -> None:
     pipeline.backward(image)
     pipeline.backward(image, plane)
     pipeline.backward(image, plane, plane)
+    pipeline.forward(scene, replace(camera, readout=Readout(np.zeros((3, 6)), 1.0, 0.0)))
     for counted in (None, mask):
         loss_sums(image, image, counted, l1_weight=0.8, ssim_weight=-0.2, gradient=image.clone())
     adam_step(row, row.clone(), row.clone(), row.clone(), 1, 0.0)
@@ -344,6 +346,9 @@ def _warm_up_formation() -> None:
     _, slope = through_curve(colours, torch.zeros(CURVE_STEPS + 1), CHANNELS)
     times_slope(colours, slope, CHANNELS)
     pixels = plane.numpy()
+    read_displacements(
+        pixels, pixels, np.ones(5, np.float32), np.zeros((3, 6), np.float32), pixels[0], pixels[0]
+    )
     for last in (CURVES, MOTION_COLUMNS):  # straight and curved paths
         still = torch.zeros(MOTION_COLUMNS)
         still[:last] = 1.0

@@ -187,7 +187,7 @@ def backpropagate(
     parameters: Parameters,
     sh_count: int,
     view: ProjectionView,
-    poses: AnyArray | None,  # [N, 12], see `own_view`
+    poses: AnyArray,  # [N, 12] or [0, 12], see `own_view`
     antialias: bool,
     splats: ArrayF32,  # [N, 16]
     pair_offsets: AnyArray,  # [N + 1]

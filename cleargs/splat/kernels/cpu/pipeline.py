@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import rasteriser
-from cleargs.splat.kernels.cpu import binning, gradients, projection, rasterise
+from cleargs.splat.kernels.cpu import binning, gradients, projection, rasterise, rolling
 from cleargs.splat.kernels.cpu.jit import LAUNCHING
 from cleargs.splat.kernels.splat_layout import PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH
 from cleargs.splat.types import Render
@@ -43,8 +44,8 @@ def read_parameters(gaussians: Gaussians) -> projection.Parameters:
     return tuple(tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values())
 
 
-def _poses(inputs: rasteriser.ForwardPass) -> AnyArray | None:
-    return None if inputs.own_poses is None else inputs.own_poses.numpy()
+def _poses(inputs: rasteriser.ForwardPass) -> AnyArray:
+    return np.empty((0, 12)) if inputs.own_poses is None else inputs.own_poses.numpy()
 
 
 class CpuRasteriser(rasteriser.Rasteriser):
@@ -55,6 +56,17 @@ class CpuRasteriser(rasteriser.Rasteriser):
 
     def __init__(self) -> None:
         super().__init__(torch.device("cpu"))
+
+    def _own_poses(self, means: Tensor, camera: Camera) -> Tensor | None:
+        readout = camera.readout
+        if readout is None:
+            return None
+        pose, out = np.ascontiguousarray(camera.world_to_camera[:3]), np.empty((len(means), 12))
+        twists = tuple(tuple(twist) for twist in readout.twists.tolist())
+        places = readout.slope, readout.start, int(not readout.columns)
+        with LAUNCHING:
+            rolling.own_poses(means.detach().contiguous().numpy(), pose, twists, *places, out)
+        return torch.from_numpy(out)
 
     def _launching(self) -> AbstractContextManager[Any]:
         return LAUNCHING

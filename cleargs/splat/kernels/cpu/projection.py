@@ -84,9 +84,9 @@ class ProjectionView(NamedTuple):
 
 
 @device
-def own_view(g: int, view: ProjectionView, poses: AnyArray | None) -> ProjectionView:
-    """Return the view of Gaussian ``g``, by its row of ``poses`` [N, 12] with a rolling shutter."""
-    if poses is None:
+def own_view(g: int, view: ProjectionView, poses: AnyArray) -> ProjectionView:
+    """Return the view of Gaussian ``g``: by its row of ``poses`` [N, 12], or of [0, 12] the view itself."""
+    if len(poses) == 0:
         return view
     p = poses[g]
     return ProjectionView(
@@ -246,7 +246,7 @@ def project(
     parameters: Parameters,
     sh_count: int,
     view: ProjectionView,
-    poses: AnyArray | None,  # [N, 12], see `own_view`
+    poses: AnyArray,  # [N, 12] or [0, 12], see `own_view`
     antialias: bool,
     width: int,
     height: int,
@@ -265,7 +265,7 @@ def project(
             tiles = 0
             if project_one(g, parameters, sh_count, own_view(g, view, poses), antialias, splats, basis):
                 tiles = count_tiles(splats[g], width, height)
-                if poses is not None:  # different poses would mix the order of Gaussians on one surface
+                if len(poses) > 0:  # different poses would mix the order of Gaussians on one surface
                     splats[g, layout.DEPTH] = max(camera_position(parameters[0][g], view)[2], NEAR)
             tile_counts[g] = tiles
             radii[g] = max(splats[g, layout.EXTENT_X], splats[g, layout.EXTENT_Y]) if tiles > 0 else ZERO
