@@ -162,8 +162,10 @@ class SceneViewer:
             )
             for still in (False, True)
         )
-        explained = seen.forward(self._with_depth(seen.camera)).clamp(0.0, 1.0).cpu().numpy()
-        render = self._with_depth(formed.camera)
+        render = self._with_depth(seen.camera)
+        explained = seen.forward(render).clamp(0.0, 1.0).cpu().numpy()
+        if seen.camera.readout is not None:
+            render = self._with_depth(formed.camera)
         return {"deblurred": _deblurred(formed, render, observed, mask), "explained": explained}
 
     def _affine(self, view: TrainingView) -> Tensor | None:
