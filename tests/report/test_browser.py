@@ -38,13 +38,19 @@ class Report(Opened):
 
     def scene(self) -> None:
         """Wait until the scene is drawn."""
-        self.page.evaluate(
-            "document.querySelector('#stage').scrollIntoView({behavior: 'instant', block: 'center'})"
-        )
+        self.box("#stage")
         self.page.wait_for_function("document.documentElement.dataset.stage")
         assert self.page.evaluate("document.documentElement.dataset.stage") == "ready", self.complaints
         self.page.wait_for_function("document.querySelector('.pane.ready')")
         self.settle()
+
+    def box(self, selector: str) -> dict[str, float]:
+        """Where an element is in the window, after it was scrolled into its middle."""
+        element = self.page.locator(selector)
+        element.evaluate("(found) => found.scrollIntoView({behavior: 'instant', block: 'center'})")
+        found = element.bounding_box()
+        assert found is not None
+        return dict(found)
 
     def settle(self) -> None:
         """Wait for a few frames of the viewer, and until it has faded in."""
@@ -140,7 +146,7 @@ def test_arrows_and_the_timeline_move_the_camera(wide: Report, run: FinishedRun)
     page.locator("#stage").focus()
     page.keyboard.press("ArrowLeft")
     stands_at(2)
-    lanes = page.locator("#lanes").bounding_box()
+    lanes = wide.box("#lanes")
     page.mouse.click(lanes["x"] + lanes["width"] * 1.5 / COUNT, lanes["y"] + lanes["height"] / 2)  # a bar
     stands_at(1)
     page.keyboard.press("ArrowRight")  # the scrubber has the focus
@@ -159,7 +165,7 @@ def test_two_clicks_measure_and_give_the_scale(wide: Report, run: FinishedRun) -
     page.evaluate("window.timeline.select(3)")
     wide.settle()
     page.locator('[data-act="measure"]').click()
-    box = page.locator(".live").bounding_box()
+    box = wide.box(".live")
     places, standing = [(0.4, 0.5), (0.6, 0.55)], wide.camera()
     for count, (x, y) in enumerate(places, 1):
         page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
@@ -232,13 +238,14 @@ def test_a_scene_with_roll_is_shown_as_filmed(wide: Report) -> None:
 def test_dragging_turns_the_camera_away_from_the_frame(wide: Report) -> None:
     page = wide.page
     standing = wide.camera()
-    box = page.locator('[data-pane="scene"]').bounding_box()
+    box = wide.box('[data-pane="scene"]')
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
+    wide.settle()  # the viewer leaves the path with the next frame
     page.mouse.move(x + 60, y, steps=6)
-    page.mouse.up()
     wide.settle()
+    page.mouse.up()
     assert np.abs(wide.camera() - standing).max() > 0.01
     assert page.evaluate("'away' in document.querySelector('#stage').dataset")
     page.locator('[data-act="back"]').click()
