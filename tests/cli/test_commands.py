@@ -218,6 +218,9 @@ def test_show(shell: Shell) -> None:
     code, out, _ = shell("show", folder)
     assert code == 0 and "complete" in out and "total 55" in out
     assert json.loads(shell("show", folder, "square", "--json")[1])["summary"] == {"total": 55}
+    code, out, _ = shell("show", folder, "time")
+    assert code == 0 and out.split()[:2] == ["part", "seconds"]
+    assert set(json.loads(shell("show", folder, "time", "--json")[1])) >= {"square"}
 
 
 def test_show_and_status_after_a_change(shell: Shell) -> None:
