@@ -18,9 +18,6 @@ from cleargs.splat.kernels.cpu.jit import compiled_mark, is_compiled
 from cleargs.splat.pace import machine_pace
 from cleargs.subprocesses import module_command
 
-NICENESS = 5
-"""Niceness that the child process adds to its own: reading the capture goes first."""
-
 _children: list[subprocess.Popen[bytes]] = []
 
 
@@ -73,7 +70,6 @@ def main() -> None:
 
     from cleargs.splat.backend import backend_for
 
-    os.nice(NICENESS)
     with _compiling("cpu"):
         if not is_compiled("cpu"):
             _compile("cpu", backend_for(torch.device("cpu")).warm_up)
