@@ -102,7 +102,9 @@ browser: .venv/browser.stamp
 
 oracles: .oracles/stamp
 
+# Anew each time, because npm does not bring back files that were deleted below.
 .oracles/stamp: Makefile
+	rm -rf .oracles
 	npm install --prefix .oracles --ignore-scripts --silent \
 		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 @adobe/spz@0.2.3 @sparkjsdev/spark@2.2.0 three@0.180.0 fzstd@0.1.1
 	# Most of the files are maps, debug builds, examples and the GPU drivers of other machines.
