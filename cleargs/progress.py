@@ -151,6 +151,16 @@ class SilentReporter:
     def warn(self, text: str) -> None: ...
 
 
+class WarningsOnly(SilentReporter):
+    """A reporter that passes on warnings alone."""
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter = reporter
+
+    def warn(self, text: str) -> None:
+        self._reporter.warn(text)
+
+
 @contextmanager
 def repeated(act: Callable[[], None], seconds: float) -> Iterator[None]:
     """Call ``act`` in a thread every ``seconds`` until the block ends."""
