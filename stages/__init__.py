@@ -5,16 +5,7 @@ The runner loads ``cleargs.stages.<name>`` by name. Each module implements `clea
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 STAGES = ("ingest", "rva", "g0", "rivr", "consolidate")
-
-
-def pace(say: Callable[[str], None] | None = None) -> float:
-    """Return the time of this machine relative to the machine on which the estimates were measured."""
-    from cleargs.splat.pace import machine_pace
-
-    return machine_pace(say)
 
 
 def gpu_fault(error: BaseException) -> str | None:

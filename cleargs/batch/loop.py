@@ -31,7 +31,7 @@ from cleargs.files import write_bytes
 from cleargs.own_files import refuse_links
 from cleargs.pipeline.outputs import Place
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunMetadata, RunSpec, read_metadata
+from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunSpec
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.pipeline.stages import Stages
@@ -102,8 +102,6 @@ class Batch:
     """Settings of all scenes. Those of a scene override them."""
     options: tuple[str, ...] = ()
     """More options for each ``cleargs run``."""
-    falls_back: bool = False
-    """True if ``--device auto`` chose the GPU: a scene on which the GPU kernels fail continues on the CPU."""
 
     def run_folder(self, scene: SceneJob) -> Path:
         return self.folder / "scenes" / scene.name
@@ -116,11 +114,10 @@ class Batch:
         """Return the arguments of ``cleargs`` that run ``scene``."""
         settings = [word for text in (*self.overrides, *scene.overrides) for word in ("--set", text)]
         until = ["--until", self.until] if self.until else []
-        device = "auto" if self.falls_back else self.device
         run, store = str(self.run_folder(scene)), str(self.store)
         return [
             *("run", str(scene.source), "-o", run, "--store", store),
-            *("--recipe", scene.recipe, *settings, *until, "--device", device, *self.options),
+            *("--recipe", scene.recipe, *settings, *until, "--device", self.device, *self.options),
         ]
 
     def check(self, sheet: Path) -> None:
@@ -292,9 +289,8 @@ class Batch:
             device="cpu",
             reporter=SilentReporter(),
         )
-        before = read_metadata(run.folder) if self.falls_back else RunMetadata()
         # The device is not checked: a login node may not have it.
-        return replace(run, device=before.device or self.device, on_cpu=before.on_cpu)
+        return replace(run, device=self.device)
 
 
 def program() -> list[str]:

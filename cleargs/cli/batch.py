@@ -91,11 +91,10 @@ def batch(
     resolved: Device = "cuda"
     if not (looks_only and device == "cuda"):
         resolved = resolve_device(device, reporter.info, test=not looks_only)
-    falls_back = device == "auto" and resolved == "cuda"
     settings = with_shortcuts((), {"quality": quality})
     root = (folder or sheet.with_suffix(".batch")).absolute()
     try:
-        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, settings, options, falls_back)
+        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, settings, options)
         scenes.check(sheet)
     except SheetError as error:
         for problem in error.problems:

@@ -538,16 +538,6 @@ def test_the_doctor_tests_the_gpu(
         assert code == (1 if tested is FAILED else 0)
 
 
-def test_the_doctor_reports_the_pace(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for pace, words in ((None, "not measured yet"), (0.934, "takes 0.93 of the reference machine's time")):
-        monkeypatch.setattr("cleargs.cli.doctor.cached_pace", lambda pace=pace: pace)
-        invoke(["doctor", "--json"])
-        (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "pace")
-        assert found == {"what": "pace", "state": "ok", "text": words}
-
-
 def test_windows_is_refused_and_macos_is_not() -> None:
     script = (
         "import sys, pydantic, cleargs.cli.main; from cleargs.cli.entry import main\n"

@@ -45,7 +45,7 @@ class Report(Opened):
         self.settle()
 
     def box(self, selector: str) -> dict[str, float]:
-        """Where an element is in the window, after it was scrolled into its middle."""
+        """Position of an element in the window, after it was scrolled into its middle."""
         element = self.page.locator(selector)
         element.evaluate("(found) => found.scrollIntoView({behavior: 'instant', block: 'center'})")
         found = element.bounding_box()
