@@ -22,14 +22,13 @@ from cleargs.media.encode import write_video
 from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
 
-from .conftest import Ingest, camera_to_world, texture
+from .conftest import Ingest, Ingested, camera_to_world, texture
 from .test_data_sets import poses_bounds
 
 
 @pytest.fixture
-def project(posed: Path, ingest: Ingest, tmp_path: Path) -> Path:
+def project(made: Ingested, tmp_path: Path) -> Path:
     """A COLMAP project of ten images: ``images/`` and ``sparse/0``."""
-    made = ingest(posed, "made")
     folder = tmp_path / "project"
     shutil.copytree(made.out / "images", folder / "images")
     shutil.copytree(made.out / "colmap/sparse", folder / "sparse")
