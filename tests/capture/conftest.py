@@ -50,8 +50,11 @@ class Ingested:
 Ingest = Callable[..., Ingested]
 
 
-def ingest_in(tmp_path: Path) -> Ingest:
-    """Return a function that runs the stage in a folder: ``ingest(source, name, threads=1, **settings)``."""
+def ingest_in(tmp_path: Path, cache: Path | None = None) -> Ingest:
+    """Return a function that runs the stage in a folder: ``ingest(source, name, threads=1, **settings)``.
+
+    ``cache`` is the folder of the models that ingest has found before (None: one below ``tmp_path``).
+    """
 
     def run(source: Path, name: str = "out", *, threads: int = 1, **settings: Any) -> Ingested:
         out, work = tmp_path / name, tmp_path / f"{name}.work"
@@ -66,7 +69,7 @@ def ingest_in(tmp_path: Path) -> Ingest:
             externals={},
             out=out,
             checkpoints=work,
-            cache=tmp_path / "kept",
+            cache=cache or tmp_path / "kept",
             seed=0,
             device="cpu",
             threads=threads,
