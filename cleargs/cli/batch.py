@@ -9,8 +9,9 @@ from typing import Any
 
 import click
 
-from cleargs.batch.loop import SUMMARY, Batch, Result, write_summary
+from cleargs.batch.loop import Batch
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
+from cleargs.batch.summary import SUMMARY, Result, write_summary
 from cleargs.cli.common import (
     answer,
     fail_below_option,

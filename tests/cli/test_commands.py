@@ -17,8 +17,9 @@ import pytest
 from toy import Bench
 
 from cleargs.cli.main import COMMANDS, explanation, invoke
+from cleargs.cli.outcome_lines import outcome_lines
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.cli.run import outcome_lines, without_effect
+from cleargs.cli.run import without_effect
 from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
