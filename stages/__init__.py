@@ -5,7 +5,7 @@ The runner loads ``cleargs.stages.<name>`` by name. Each module implements `clea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 
 STAGES = ("ingest", "rva", "g0", "rivr", "consolidate")
 TRAININGS = frozenset({"g0", "rivr", "consolidate"})
@@ -17,13 +17,6 @@ def prepare(names: Collection[str]) -> None:
         from cleargs.splat import compilation
 
         compilation.begin()
-
-
-def pace(say: Callable[[str], None] | None = None) -> float:
-    """Return the time of this machine relative to the machine on which the estimates were measured."""
-    from cleargs.splat.pace import machine_pace
-
-    return machine_pace(say)
 
 
 def gpu_fault(error: BaseException) -> str | None:

@@ -14,7 +14,6 @@ from cleargs.pipeline.stages import installed
 from cleargs.progress import COMPILING, LineReporter, SilentReporter
 from cleargs.splat import compilation
 from cleargs.splat.kernels.cpu.jit import compiled_mark
-from cleargs.splat.pace import machine_pace
 
 
 def test_cache_falls_back_to_a_temporary_folder(monkeypatch, tmp_path):
@@ -115,9 +114,3 @@ def test_a_run_compiles_next_to_its_first_stage(monkeypatch, tmp_path):
     compilation.finish("cpu", lambda: None, SilentReporter())
     prepare(["g0"])
     assert len(started) == 1, "the kernels are compiled"
-
-
-def test_the_pace_is_not_measured_before_kernels_are_compiled(monkeypatch, tmp_path):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    said: list[str] = []
-    assert machine_pace(said.append) == 1.0 and not said

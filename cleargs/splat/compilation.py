@@ -1,8 +1,7 @@
 """Compiling the kernels, which a machine does once.
 
 `begin` compiles those of the CPU in a child process, while a run reads its capture. `finish` waits for it, or
-compiles itself. ``python -m cleargs.splat.compilation`` is the child process. It then measures the pace of
-the machine, which needs compiled kernels.
+compiles itself. ``python -m cleargs.splat.compilation`` is the child process.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from contextlib import contextmanager, suppress
 
 from cleargs.progress import COMPILING, Reporter
 from cleargs.splat.kernels.cpu.jit import compiled_mark, is_compiled
-from cleargs.splat.pace import machine_pace
 from cleargs.subprocesses import module_command
 
 _children: list[subprocess.Popen[bytes]] = []
@@ -65,7 +63,7 @@ def _compile(device: str, warm_up: Callable[[], None]) -> None:
 
 
 def main() -> None:
-    """Compile the kernels of the CPU unless another process did, then measure the pace of the machine."""
+    """Compile the kernels of the CPU, unless another process did."""
     import torch
 
     from cleargs.splat.backend import backend_for
@@ -73,7 +71,6 @@ def main() -> None:
     with _compiling("cpu"):
         if not is_compiled("cpu"):
             _compile("cpu", backend_for(torch.device("cpu")).warm_up)
-    machine_pace(say=lambda text: None)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
 
 from . import apps
-from .conftest import FOCAL, HEIGHT, WIDTH, Ingest
+from .conftest import FOCAL, HEIGHT, WIDTH, Ingest, Ingested
 from .test_data_sets import poses_bounds
 
 Frames = Sequence[tuple[NDArray[np.float64], NDArray[np.uint8]]]
@@ -415,10 +415,8 @@ def test_masks_that_fit_no_photograph_are_named(tmp_path: Path, frames: Frames) 
 
 
 @pytest.mark.parametrize("only", [None, "images/00000[0-4].png"])
-def test_listed_pictures_are_told(
-    posed: Path, frames: Frames, ingest: Ingest, tmp_path: Path, only: str | None
-) -> None:
-    made, root, config = ingest(posed, "made"), tmp_path / "project", IngestConfig(only=only)
+def test_listed_pictures_are_told(made: Ingested, frames: Frames, tmp_path: Path, only: str | None) -> None:
+    root, config = tmp_path / "project", IngestConfig(only=only)
     shutil.copytree(made.out / "images", root / "images")
     shutil.copytree(made.out / "colmap/sparse", root / "sparse")
     apps.save(root / "images_2/000000.png", np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
