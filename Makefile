@@ -1,6 +1,7 @@
 # make demo              install the program and run all stages on a small synthetic capture; the last line names its report
 # make env               install the program alone, in .venv
-# make test              run all tests that are not slow
+# make test              run all tests that are not slow, apart from those of benchmarks/
+# make test-quick        run those of files that take less than three seconds of a processor each
 # make test-all          run all tests
 # make test-package      build wheel and sdist, install them separately, and run the smoke demo from the wheel
 # make drill             kill every stage and gc 50 times, plant 1,000 links in runs, and compare
@@ -33,7 +34,7 @@ define install
 endef
 PINS := pyproject.toml requirements.lock constraints.txt
 
-.PHONY: demo env test test-all test-package drill fuzz findings test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
+.PHONY: demo env test test-quick test-all test-package drill fuzz findings test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
 
 env: .venv/demo.stamp
 	@echo "ClearGS is installed in $(CURDIR)/.venv. Next, in the folder of your video:"
@@ -44,8 +45,14 @@ demo: .venv/demo.stamp
 	$(BIN)/cleargs demo
 
 # The tests of a file run in one process, so that they make shared fixtures once.
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
+
 test: .venv/test.stamp
-	$(BIN)/python -m pytest -m 'not slow' --numprocesses auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python tests/warm_kernels.py
+	$(BIN)/python -m pytest -m 'not slow and not benchmarks' $(PARALLEL)
+
+test-quick: .venv/test.stamp
+	$(BIN)/python -m pytest -m 'not slow and not benchmarks and not heavy' $(PARALLEL)
 
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest
@@ -83,7 +90,7 @@ findings:
 	if [ -n "$$changed" ]; then echo "changed:$$changed"; exit 1; fi
 
 test-gpu-kernels: .venv/cuda.stamp
-	TRITON_INTERPRET=1 $(BIN)/python -m pytest -m gpu tests/gpu tests/splat tests/formation
+	TRITON_INTERPRET=1 $(BIN)/python -m pytest -m gpu $(PARALLEL) tests/gpu tests/splat tests/formation
 
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .

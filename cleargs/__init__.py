@@ -1,7 +1,6 @@
 """ClearGS: clean 3D Gaussian Splatting scenes from handheld videos of mixed quality."""
 
 from importlib import import_module
-from warnings import warn
 
 __version__ = "0.2.0"
 
@@ -9,14 +8,14 @@ __version__ = "0.2.0"
 _HOMES = {
     "run": "api",
     **dict.fromkeys(("open_run", "Run", "StageResults", "open_prepared", "Prepared"), "run_results"),
-    **dict.fromkeys(("initialise", "train", "render_view", "save", "load"), "api_parts"),
+    **dict.fromkeys(("initialise", "train", "render_view", "save", "load"), "api_scenes"),
     **dict.fromkeys(("export", "film"), "api"),
-    **dict.fromkeys(("score_frames", "score", "restore"), "api_parts"),
-    **dict.fromkeys(("deblur", "evaluate_scene", "write_report"), "api"),
+    **dict.fromkeys(("score_frames", "score", "restore", "deblur"), "api_images"),
+    **dict.fromkeys(("evaluate_scene", "write_report"), "api"),
     "make_capture": "synth.synthetic_capture",
     "Camera": "splat.camera",
     "CleargsError": "errors",
-    "G0Config": "stages.config",
+    "G0Config": "scene.config",
     "Gaussians": "splat.gaussians",
     "Scene": "splat.scene",
     "TrainConfig": "splat.config",
@@ -24,14 +23,8 @@ _HOMES = {
 }
 __all__ = list(_HOMES)
 
-# Former name -> present name. A former name works for one release.
-_RENAMED = {"View": "TrainingView"}
-
 
 def __getattr__(name: str) -> object:
-    if name in _RENAMED:
-        warn(f"cleargs.{name} is now cleargs.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
-        name = _RENAMED[name]
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,4 +1,6 @@
-"""The Python API: runs and their results. Scenes and images without a run are in `cleargs.api_parts`.
+"""The Python API: runs and their results.
+
+Scenes and images without a run are in `cleargs.api_scenes` and `cleargs.api_images`.
 
 ``threads`` is the number of threads (default: all usable cores). Errors are `CleargsError` with a ``hint``.
 The examples use a capture ``room`` and its run folder ``run``.
@@ -12,20 +14,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cleargs.api_parts import Progress, reporter_of, save
+from cleargs.api_scenes import save
 from cleargs.capture.sources import whole_capture
-from cleargs.errors import InputError
-from cleargs.packed import require_images
 from cleargs.pipeline.session import DeviceChoice, default_folder, opened_store, resolve_run, usable_cores
 from cleargs.pipeline.stages import installed
-from cleargs.progress import log_reporter
-from cleargs.run_results import SCENE, Run, open_prepared, open_run, scene_stage
+from cleargs.progress import Progress, log_reporter, reporter_of
+from cleargs.run_results import SCENE, Run, open_run, scene_stage
 from cleargs.splat.config import Quality
 
 if TYPE_CHECKING:
     from cleargs.evaluate.config import EvalOptions
     from cleargs.evaluate.eval_report import Evaluation
-    from cleargs.scene.viewer import Deblurred
     from cleargs.splat.scene import Scene
 
 
@@ -148,32 +147,6 @@ def write_report(run: Run, *, threads: int | None = None) -> Path:
     spec = read_run_file(run.folder, dag)
     with opened_store(spec.store) as opened:
         return write_report(Planner(dag, spec, opened, threads or usable_cores(), log_reporter()))
-
-
-def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | None:
-    """Remove motion blur, rolling shutter and defocus from a raw frame, as fitted by a trained scene.
-
-    Rolling shutter is removed only if the training detected it in the capture. ``stage`` is the stage that
-    trained the scene (default: the last one that has a scene). Raises InputError if the frame has no pose.
-
-    Returns:
-        ``image`` [H, W, 3], float32 sRGB in [0, 1], and ``formation``, the effects that were removed. None if
-        no effect explains the frame better than the sharp render.
-
-    Example:
-        deblurred = cg.deblur(cg.open_run("run"), 3)
-        if deblurred is not None:
-            print(deblurred.formation.blur_px, deblurred.image.shape)
-    """
-    from cleargs.scene.viewer import SceneViewer
-    from cleargs.scene.views import view_of
-
-    require_images(run.folder, "deblurring")
-    capture = open_prepared(run["ingest"])
-    frame = next((frame for frame in capture.frames if frame.frame_id == frame_id), None)
-    if frame is None or not frame.registered:
-        raise InputError(f"frame {frame_id} has no pose", hint="see cleargs show RUN ingest")
-    return SceneViewer(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
 
 
 def evaluate_scene(

@@ -238,3 +238,16 @@ def log_reporter() -> LineReporter:
     """Return a reporter that writes to the logger ``cleargs``, the default of the Python API."""
     logger = logging.getLogger("cleargs")
     return LineReporter(*(partial(log, "%s") for log in (logger.info, logger.warning, logger.debug)))
+
+
+Progress = Reporter | Say | None
+"""Receiver of progress and remarks: the logger ``cleargs`` (None), a function that receives lines, or a
+`cleargs.progress.Reporter`."""
+
+
+def reporter_of(progress: Progress) -> Reporter:
+    if progress is None:
+        return log_reporter()
+    if callable(progress):
+        return LineReporter(progress, lambda text: progress(f"warning: {text}"), progress)
+    return progress

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from cleargs.base_model import FrozenModel
 from cleargs.plugins import installed_version
+from cleargs.rivr.config import RepairConfig
+from cleargs.rivr.harm import HarmConfig
+from cleargs.scene.config import G0_END
 from cleargs.splat.config import OFF, TrainConfig, steps_from_frames
 from cleargs.types import Device
 
-G0_END, ROUNDS_END = 16 / 19, 18 / 19
-"""Positions, from 0 to 1, in the schedule of all trainings: the ends of G0 and of RIVR's rounds."""
+ROUNDS_END = 18 / 19
+"""Position, from 0 to 1, in the schedule of all trainings: the end of RIVR's rounds."""
 
 MAX_ROUNDS = 16
 """Maximum number of RIVR's rounds."""
@@ -29,44 +32,16 @@ REPAIR_LIBRARIES = (
 )
 
 
+def kernel_libraries(device: Device, config: object) -> Mapping[str, str]:
+    """Return the versions of the other libraries of the kernels on ``device``."""
+    return {"triton": installed_version("triton")} if device == "cuda" else {}
+
+
 def other_libraries(device: Device, config: object) -> Mapping[str, str]:
     """Return the versions of the other libraries that compute on ``device`` in rivr and consolidate."""
     from cleargs.models.onnx import runtime_version
 
-    kernels = {"triton": installed_version("triton")} if device == "cuda" else {}
-    return {"onnxruntime": runtime_version(device), **kernels}
-
-
-class G0Config(TrainConfig):
-    """The first scene, from the sparse points and the frames that RVA keeps."""
-
-    end: float = Field(
-        G0_END,
-        gt=0,
-        le=1,
-        description="end of this training in the schedule, as a fraction; RIVR and the consolidation "
-        "continue from there. 1: for a scene that no other training continues",
-    )
-    sh_degree: int | None = Field(
-        None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
-    )
-    exposure: Literal["auto", "on", "off"] = Field(
-        "auto",
-        description="one colour affine per frame; auto = on if the brightness of the frames, measured at "
-        "the sparse points, spreads by more than 5 %, or a colour channel without it by more than 2.5 %",
-    )
-    antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
-    min_points: int = Field(
-        10_000,
-        ge=1,
-        le=5_000_000,
-        description="fewest Gaussians to start from, within the budget; points are added to reach it",
-    )
-
-    exposure_threshold: ClassVar[float] = 0.05
-    """``auto`` is on if the `gain_spread` of the frames is above this. With a fixed exposure it is below."""
-    colour_threshold: ClassVar[float] = 0.025
-    """The same for the channels without the brightness. Captures with one white balance had .001 to .024."""
+    return {"onnxruntime": runtime_version(device), **kernel_libraries(device, config)}
 
 
 class DistilConfig(FrozenModel):
@@ -106,3 +81,68 @@ class DistilConfig(FrozenModel):
             "scale_reg": 0.0,
         }
         return TrainConfig(**{**inherited, **own})
+
+
+class RoundsConfig(DistilConfig):
+    """The distillations of RIVR's rounds, which follow each other in one part of the schedule."""
+
+    begin: float = Field(
+        G0_END, ge=0, lt=1, description="start of the first round in the schedule, as a fraction"
+    )
+    end: float = Field(
+        ROUNDS_END, gt=0, le=1, description="end of the last round in the schedule, as a fraction"
+    )
+
+
+class RivrConfig(RepairConfig):
+    """Render-Guided In-Video Restoration."""
+
+    rounds: int = Field(
+        2,
+        ge=0,
+        le=MAX_ROUNDS,
+        description="rounds in which every target frame is repaired; 0: no repairs, the scene is that of g0",
+    )
+    targets: Literal["auto", "all"] = Field(
+        "auto",
+        description="frames to repair: all registered training frames; auto = those that image formation and "
+        "RVA leave in need, and the next ones up to a sixteenth of the frames",
+    )
+    expert: str = Field(
+        "embedded",
+        description="restoration expert: embedded, a name of `cleargs models list`, an ONNX file, or one "
+        "of another package",
+        json_schema_extra={"key": False, "plugin": "experts"},  # the key contains the digest of its file
+    )
+    primary_scorer: str = Field(
+        "clarity-net",
+        description="decides between candidates: the name of a scorer, or an ONNX file",
+        json_schema_extra={"key": False, "plugin": "scorers"},  # as for the expert
+    )
+    tiebreak_scorer: str = Field(
+        "naturalness-stats",
+        description="decides near-ties: the name of a scorer, or an ONNX file",
+        json_schema_extra={"key": False, "plugin": "scorers"},
+    )
+    group: int | None = Field(
+        None,
+        ge=1,
+        description="maximum number of target frames that are repaired from one scene: a round has groups "
+        "along the trajectory, and the repairs of a group are distilled before the next one is rendered, as "
+        "in the paper; unset = one group. The groups share distil.steps of the round",
+    )
+    distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")
+    harm: HarmConfig = Field(
+        HarmConfig(), description="limits beyond which the distilled scene is rejected for G0"
+    )
+
+    def distillation(self, g0: TrainConfig, round: int, done: int, steps: int, frames: int) -> TrainConfig:
+        """Return the settings of a training of ``steps`` steps with its part of the schedule.
+
+        ``round`` counts from 1. ``done`` steps of the round precede this training. If the steps of a round
+        are unset, they follow from the number of active ``frames``.
+        """
+        whole = self.distil.applied_to(g0, frames)
+        step = (whole.end - whole.begin) / (self.rounds * whole.length)
+        begin = whole.begin + step * ((round - 1) * whole.length + done)
+        return whole.model_copy(update={"steps": steps, "begin": begin, "end": begin + step * steps})

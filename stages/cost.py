@@ -11,7 +11,9 @@ from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.splat.budget import TrainingCost, training_cost
 
 if TYPE_CHECKING:
-    from .config import DistilConfig, G0Config
+    from cleargs.scene.config import G0Config
+
+    from .config import DistilConfig
 
 _UNKNOWN = (60, 0.5)  # number of frames, and megapixels per frame, that are assumed for an unknown capture
 _POINTS_PER_FRAME = 250  # assumed before ingest: captures of 16 to 150 frames gave 80 to 350 sparse points

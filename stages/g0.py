@@ -7,11 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
-from cleargs.plugins import installed_version
+from cleargs.scene.config import G0Config
 from cleargs.scene.folder import LOG, TRAINED
-from cleargs.types import Device
-
-from .config import G0Config
 
 VERSION = 48
 CONFIG = G0Config
@@ -30,11 +27,6 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
 OUTPUTS = (*TRAINED, LOG)
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
-
-
-def other_libraries(device: Device, config: object) -> Mapping[str, str]:
-    """Return the versions of further libraries that compute on ``device``."""
-    return {"triton": installed_version("triton")} if device == "cuda" else {}
 
 
 def externals(config: G0Config, source: Path) -> Mapping[str, Path]:

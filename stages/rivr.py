@@ -5,18 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Any
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.rivr.config import RepairConfig
-from cleargs.rivr.harm import HarmConfig
 from cleargs.scene.folder import LOG, TRAINED, SceneFolder
-from cleargs.splat.config import TrainConfig
 
-from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, DistilConfig
+from .config import REPAIR_LIBRARIES, RivrConfig
 from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
@@ -25,71 +20,6 @@ if TYPE_CHECKING:
     from cleargs.rivr.targets import Supervision
     from cleargs.scene.viewer import SceneViewer
     from cleargs.splat.views import TrainingView
-
-
-class RoundsConfig(DistilConfig):
-    """The distillations of RIVR's rounds, which follow each other in one part of the schedule."""
-
-    begin: float = Field(
-        G0_END, ge=0, lt=1, description="start of the first round in the schedule, as a fraction"
-    )
-    end: float = Field(
-        ROUNDS_END, gt=0, le=1, description="end of the last round in the schedule, as a fraction"
-    )
-
-
-class RivrConfig(RepairConfig):
-    """Render-Guided In-Video Restoration."""
-
-    rounds: int = Field(
-        2,
-        ge=0,
-        le=MAX_ROUNDS,
-        description="rounds in which every target frame is repaired; 0: no repairs, the scene is that of g0",
-    )
-    targets: Literal["auto", "all"] = Field(
-        "auto",
-        description="frames to repair: all registered training frames; auto = those that image formation and "
-        "RVA leave in need, and the next ones up to a sixteenth of the frames",
-    )
-    expert: str = Field(
-        "embedded",
-        description="restoration expert: embedded, a name of `cleargs models list`, an ONNX file, or one "
-        "of another package",
-        json_schema_extra={"key": False, "plugin": "experts"},  # the key contains the digest of its file
-    )
-    primary_scorer: str = Field(
-        "clarity-net",
-        description="decides between candidates: the name of a scorer, or an ONNX file",
-        json_schema_extra={"key": False, "plugin": "scorers"},  # as for the expert
-    )
-    tiebreak_scorer: str = Field(
-        "naturalness-stats",
-        description="decides near-ties: the name of a scorer, or an ONNX file",
-        json_schema_extra={"key": False, "plugin": "scorers"},
-    )
-    group: int | None = Field(
-        None,
-        ge=1,
-        description="maximum number of target frames that are repaired from one scene: a round has groups "
-        "along the trajectory, and the repairs of a group are distilled before the next one is rendered, as "
-        "in the paper; unset = one group. The groups share distil.steps of the round",
-    )
-    distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")
-    harm: HarmConfig = Field(
-        HarmConfig(), description="limits beyond which the distilled scene is rejected for G0"
-    )
-
-    def distillation(self, g0: TrainConfig, round: int, done: int, steps: int, frames: int) -> TrainConfig:
-        """Return the settings of a training of ``steps`` steps with its part of the schedule.
-
-        ``round`` counts from 1. ``done`` steps of the round precede this training. If the steps of a round
-        are unset, they follow from the number of active ``frames``.
-        """
-        whole = self.distil.applied_to(g0, frames)
-        step = (whole.end - whole.begin) / (self.rounds * whole.length)
-        begin = whole.begin + step * ((round - 1) * whole.length + done)
-        return whole.model_copy(update={"steps": steps, "begin": begin, "end": begin + step * steps})
 
 
 AUTO_SHARE = 0.125

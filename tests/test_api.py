@@ -31,13 +31,6 @@ def test_every_name_is_there_and_the_stub_says_the_same() -> None:
         cg.nothing_such  # noqa: B018
 
 
-def test_former_names_give_the_present_object_and_a_warning() -> None:
-    assert set(cg._RENAMED.values()) <= set(cg.__all__) and cg._RENAMED.keys().isdisjoint(cg.__all__)
-    for former, present in cg._RENAMED.items():
-        with pytest.warns(DeprecationWarning, match=f"cleargs.{present}"):
-            assert getattr(cg, former) is getattr(cg, present)
-
-
 def test_the_import_loads_nothing_heavy() -> None:
     """Neither `import cleargs` nor reading the tables of a run imports heavy libraries."""
     code = (

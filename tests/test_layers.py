@@ -21,7 +21,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cleargs.handover",),
     ("cleargs.run_results",),  # reads the results of a finished run
     ("cleargs.report", "cleargs.render"),
-    ("cleargs.api_parts",),
+    ("cleargs.api_scenes", "cleargs.api_images"),
     ("cleargs.api",),
     ("cleargs.stages", "cleargs.workflows"),
     ("cleargs.batch",),

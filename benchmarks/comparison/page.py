@@ -31,11 +31,12 @@ from benchmarks.comparison.tables import (
 from benchmarks.comparison.variants import WHOLE
 from cleargs.capture.tables import load_frames
 from cleargs.evaluate.eval_report import Evaluation
-from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
+from cleargs.evaluate.reference_views import ReferenceView, stem_of
+from cleargs.evaluate.references import reference_of
 from cleargs.files import whole_folder
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
-from cleargs.report.page import page_environment, page_html
+from cleargs.report.html import page_environment, page_html
 from cleargs.report.pictures import ImageFile, side_of, write_jpeg
 from cleargs.report.report_json import PAGE, page_of
 

@@ -30,7 +30,7 @@ from benchmarks.speed.timing import Clock, Quartiles, interleave, ratio
 from benchmarks.speed.work import size_of, work_of
 from cleargs.progress import Reporter
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.pace import random_scene
+from cleargs.splat.random_scene import random_scene
 
 RASTERISER = ("rasterise.forward", "rasterise.backward", "gradients.backpropagate")
 """Kernels of ClearGS in the comparison of rasterisers. The last one adds the pairs' gradients, as autograd

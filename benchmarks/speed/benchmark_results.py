@@ -6,6 +6,7 @@ import os
 import platform
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import cleargs
@@ -15,7 +16,6 @@ from benchmarks.speed.peaks import Peaks
 from benchmarks.speed.roofline import Roof
 from benchmarks.speed.timing import Quartiles
 from benchmarks.speed.work import Size
-from cleargs.splat.pace import processor_name
 
 Times = dict[str, Quartiles]
 """Part of an iteration -> time in ms."""
@@ -118,3 +118,13 @@ def describe_machine(load_before: float) -> Machine:
         load_before=load_before,
         load_after=os.getloadavg()[0],
     )
+
+
+def processor_name() -> str:
+    """Return the model name of the processor on Linux, or the architecture on other systems."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

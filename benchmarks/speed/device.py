@@ -23,7 +23,7 @@ from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
-from cleargs.splat.pace import random_scene
+from cleargs.splat.random_scene import random_scene
 
 MEMORY_REPETITIONS = 3
 """Iterations over which the peak memory is taken."""

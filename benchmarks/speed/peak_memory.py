@@ -40,7 +40,7 @@ def _measure(count: int, width: int, height: int, sigma: float) -> int | None:
     from benchmarks.speed.iteration import Iteration
     from benchmarks.speed.timing import Clock
     from cleargs.splat.kernels.cpu.backend import warm_up
-    from cleargs.splat.pace import random_scene
+    from cleargs.splat.random_scene import random_scene
 
     warm_up()
     try:

@@ -1,4 +1,4 @@
-"""Scenes and images for benchmarks, in addition to `cleargs.splat.pace.random_scene`."""
+"""Scenes and images for benchmarks, in addition to `cleargs.splat.random_scene.random_scene`."""
 
 from __future__ import annotations
 

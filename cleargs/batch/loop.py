@@ -12,79 +12,31 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
-
-from rich.filesize import decimal
 
 from cleargs.batch.sheet import SceneJob, SheetError
+from cleargs.batch.summary import HEADER, SUMMARY, Result, State
 from cleargs.capture.sources import whole_capture
-from cleargs.capture.summary import IngestSummary
 from cleargs.errors import CleargsError, InputError, listed
 from cleargs.files import write_bytes
 from cleargs.own_files import refuse_links
 from cleargs.pipeline.outputs import Place
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunMetadata, RunSpec, read_metadata
+from cleargs.pipeline.run_file import RUN_FILE, SCENE, RunSpec
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import is_store, visible_names
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.render import TARGETS
-from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
-from cleargs.rivr.summaries import TrainingSummary
 from cleargs.safe_io import read_bytes
 from cleargs.subprocesses import module_command
 from cleargs.types import Device
-
-SUMMARY = "summary.csv"
-
-_HEADER = b"scene,state,"
-"""Begin of a summary."""
-
-State = Literal["failed", "waiting", "partial", "done"]
-"""``waiting``: stages are missing, and the last attempt, if any, reported no error."""
-
-
-@dataclass(frozen=True)
-class Result:
-    """State and figures of a scene: a row of ``summary.csv``."""
-
-    scene: str
-    state: State
-    frames: int | None
-    frames_placed: int | None
-    psnr_unseen: float | None
-    """PSNR of the last scene on pixels that no training saw, in dB."""
-    minutes: float
-    """Total time of all stages."""
-    memory_gb: float
-    """Largest peak memory of a stage, GB (1e9 bytes)."""
-    disk_gb: float
-    """Size of all results, GB (1e9 bytes)."""
-    cause: str
-    """Cause of the failure, or missing outputs."""
-
-    def figures(self) -> list[tuple[str, str]]:
-        """Return the known figures as (value, meaning)."""
-        found = []
-        if self.frames is not None:
-            found.append((f"{self.frames_placed} of {self.frames}", "frames placed"))
-        if self.psnr_unseen is not None:
-            found.append((f"{self.psnr_unseen:.1f} dB", "PSNR on pixels that no training saw"))
-        if self.minutes:
-            found.append((duration(60 * self.minutes), "of work"))
-            found.append((f"{self.memory_gb:.1f} GB", "of memory"))
-            found.append((decimal(round(1e9 * self.disk_gb)), "on disk"))
-        return found
 
 
 @dataclass(frozen=True)
@@ -102,8 +54,6 @@ class Batch:
     """Settings of all scenes. Those of a scene override them."""
     options: tuple[str, ...] = ()
     """More options for each ``cleargs run``."""
-    falls_back: bool = False
-    """True if ``--device auto`` chose the GPU: a scene on which the GPU kernels fail continues on the CPU."""
 
     def run_folder(self, scene: SceneJob) -> Path:
         return self.folder / "scenes" / scene.name
@@ -116,11 +66,10 @@ class Batch:
         """Return the arguments of ``cleargs`` that run ``scene``."""
         settings = [word for text in (*self.overrides, *scene.overrides) for word in ("--set", text)]
         until = ["--until", self.until] if self.until else []
-        device = "auto" if self.falls_back else self.device
         run, store = str(self.run_folder(scene)), str(self.store)
         return [
             *("run", str(scene.source), "-o", run, "--store", store),
-            *("--recipe", scene.recipe, *settings, *until, "--device", device, *self.options),
+            *("--recipe", scene.recipe, *settings, *until, "--device", self.device, *self.options),
         ]
 
     def check(self, sheet: Path) -> None:
@@ -160,7 +109,7 @@ class Batch:
         marks = ("plan.json", f"scenes/*/{RUN_FILE}")  # the Snakefile makes the first, a scene the second
         known = is_store(self.store) or any(any(self.folder.glob(mark)) for mark in marks)
         if summary.is_file():
-            known = read_bytes(summary, root=self.folder).startswith(_HEADER)
+            known = read_bytes(summary, root=self.folder).startswith(HEADER)
         if names and not known:
             raise InputError(
                 f"{self.folder} is not empty and is not a batch; it has {listed(names)}",
@@ -248,20 +197,7 @@ class Batch:
     def result(self, scene: SceneJob) -> Result:
         """Return the present state and figures of ``scene``."""
         made = linked_manifests(self.run_folder(scene), self.dag.names)
-        ingest = IngestSummary.of(made.get("ingest"))
-        psnr = [TrainingSummary.of(manifest).psnr_unseen for manifest in made.values()]
-        state, cause = self._state(scene)
-        return Result(
-            scene=scene.name,
-            state=state,
-            frames=ingest.frames,
-            frames_placed=ingest.registered,
-            psnr_unseen=next((value for value in reversed(psnr) if value is not None), None),
-            minutes=round(sum(manifest.seconds for manifest in made.values()) / 60, 2),
-            memory_gb=max((manifest.peak_memory_gb or 0.0 for manifest in made.values()), default=0.0),
-            disk_gb=round(sum(manifest.bytes for manifest in made.values()) / 1e9, 3),
-            cause=cause,
-        )
+        return Result.of(scene.name, made, *self._state(scene))
 
     def _state(self, scene: SceneJob) -> tuple[State, str]:
         try:
@@ -292,20 +228,10 @@ class Batch:
             device="cpu",
             reporter=SilentReporter(),
         )
-        before = read_metadata(run.folder) if self.falls_back else RunMetadata()
         # The device is not checked: a login node may not have it.
-        return replace(run, device=before.device or self.device, on_cpu=before.on_cpu)
+        return replace(run, device=self.device)
 
 
 def program() -> list[str]:
     """Return a command that starts ``cleargs`` even if its script is not next to the interpreter."""
     return module_command("cleargs")
-
-
-def write_summary(path: Path, results: Sequence[Result]) -> None:
-    """Write one row per scene. Raises StoreError."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(Result)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(result) for result in results)
-    write_bytes(path, text.getvalue().encode())

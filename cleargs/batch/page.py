@@ -11,15 +11,16 @@ from urllib.parse import quote
 
 from rich.filesize import decimal
 
-from cleargs.batch.loop import Batch, Result, State
+from cleargs.batch.loop import Batch
 from cleargs.batch.sheet import SceneJob
+from cleargs.batch.summary import Result, State
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
 from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
 from cleargs.report.formatting import count, duration
-from cleargs.report.page import page_html
+from cleargs.report.html import page_html
 from cleargs.report.pictures import ImageFile, side_of, write_jpeg
 from cleargs.report.report_json import FOLDER, PAGE, is_current, linked_manifests, page_of, require_own
 

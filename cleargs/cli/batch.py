@@ -9,8 +9,9 @@ from typing import Any
 
 import click
 
-from cleargs.batch.loop import SUMMARY, Batch, Result, write_summary
+from cleargs.batch.loop import Batch
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
+from cleargs.batch.summary import SUMMARY, Result, write_summary
 from cleargs.cli.common import (
     answer,
     fail_below_option,
@@ -91,11 +92,10 @@ def batch(
     resolved: Device = "cuda"
     if not (looks_only and device == "cuda"):
         resolved = resolve_device(device, reporter.info, test=not looks_only)
-    falls_back = device == "auto" and resolved == "cuda"
     settings = with_shortcuts((), {"quality": quality})
     root = (folder or sheet.with_suffix(".batch")).absolute()
     try:
-        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, settings, options, falls_back)
+        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, settings, options)
         scenes.check(sheet)
     except SheetError as error:
         for problem in error.problems:

@@ -19,7 +19,6 @@ from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import usable_cores
 from cleargs.plugins import installed_version
 from cleargs.splat.kernels.memory import available_memory
-from cleargs.splat.pace import cached_pace
 
 LIBRARIES = (
     "torch",
@@ -51,9 +50,8 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
 
     FOLDER is the folder for runs. The exit code is 1 if a run would fail on this machine.
     """
-    pace, config = cached_pace(), user_config_file()
+    config = user_config_file()
     device, report = _device(wants_test)
-    speed = "not measured yet" if pace is None else f"takes {pace:.2f} of the reference machine's time"
     findings = [
         Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
         *(_library(name) for name in LIBRARIES),
@@ -62,7 +60,6 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
         _room("disk", shutil.disk_usage(folder).free, 5.0, "cleargs gc frees what no run needs"),
         device,
         Finding("configuration", "ok", f"{'' if config.is_file() else 'no '}{config}"),
-        Finding("pace", "ok", speed),
         _writable("runs", folder),
         _writable("caches", Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")),
         _writable("temporary files", Path(tempfile.gettempdir())),

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import resource
 import shutil
-from collections.abc import Iterable, Mapping
-from contextlib import ExitStack
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,9 +29,6 @@ MIN_ADDRESS_SPACE_GB = 2.0
 MORE_ADDRESS_SPACE_GB = 3.5
 """Address space that a run needs in addition to the estimated memory, for libraries and stacks of threads.
 Measured with 12 frames of 240x136 (estimate 1.1 GB): a limit of 4.0 GB is too low, and 4.5 GB are enough."""
-
-WORTH_MEASURING_MIN = 2.0
-"""Expected work, in minutes, from which measuring the speed of this machine is worth its seconds."""
 
 STEADY_S = 20.0
 """Seconds that are added to measured and expected times before they are compared."""
@@ -110,8 +105,8 @@ class Planner:
             inputs=inputs,
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
-            device=self.run.device_of(name),
-            libraries=library_versions(stage, self.run.device_of(name), config) | plugin_versions(config),
+            device=self.run.device,
+            libraries=library_versions(stage, self.run.device, config) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited: dict[str, None] = {}  # an ordered set
@@ -146,17 +141,23 @@ class Planner:
         places = self._externals(name)
         for folder in (self.run.folder, self.run.source, self.store.root):
             require_utf8(folder)
-        self._keep_apart(places.values())
+        self._keep_apart(places)
         return {role: self.store.memo.digests_of(place, rehash=rehash) for role, place in places.items()}
 
-    def _keep_apart(self, places: Iterable[External]) -> None:
-        """Raise InputError unless the run, its store and the ``places`` of its inputs are apart."""
+    def _keep_apart(self, places: Mapping[str, External]) -> None:
+        """Raise InputError unless the run, its store and the ``places`` of its inputs (by role) are apart.
+
+        The run may be next to what a folder holds (``images/``, videos), but not among its photographs.
+        """
         run, source, hint = self.run.folder, self.run.source, "choose a folder next to the input with -o"
         given = Place(source, hard_links=False)
         within = Place(run).is_inside(source)
         if within and given.is_inside(run):
             raise InputError(f"the run folder {run} is the input itself", hint=hint)
-        folders = [place for place in places if isinstance(place, Path)]
+        folders = [place for place in places.values() if isinstance(place, Path)]
+        listed = [(role, place) for role, place in places.items() if isinstance(place, Mapping)]
+        around = {(role, file.parent) for role, files in listed for file in files.values()}
+        folders += {folder for role, folder in around if role == "capture" or folder != source}
         for place in folders if within else (*folders, source):
             for what, folder, option in (("run folder", run, "-o"), ("store", self.store.root, "--store")):
                 if Place(folder).is_inside(place):
@@ -177,29 +178,6 @@ class Planner:
         changes = differences(before.parts, stage_key.parts, before.origins, stage_key.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
-    @cached_property
-    def pace(self) -> float:
-        """Factor of the estimates: time on this machine divided by that on the machine of the estimates."""
-        return self.dag.pace(None)
-
-    def at_measured_pace(self, plans: list[StagePlan]) -> list[StagePlan]:
-        """Return ``plans`` with the costs on this machine. Measures its pace unless it is known.
-
-        Short plans are returned as they are, because measuring takes seconds. So are those for a GPU, whose
-        pace is not measured.
-        """
-        costs = [plan.estimate.minutes for plan in plans if plan.estimate is not None]
-        if self.run.device != "cpu" or sum(costs) < WORTH_MEASURING_MIN:
-            return plans
-        with ExitStack() as tasks:
-            announced = lambda text: tasks.enter_context(self.reporter.task(text))  # noqa: E731
-            before, self.pace = self.pace, self.dag.pace(announced)
-        factor = self.pace / before
-        return [
-            plan if plan.estimate is None else replace(plan, estimate=plan.estimate.at_pace(factor))
-            for plan in plans
-        ]
-
     def pace_of(self, made: Mapping[str, Manifest]) -> float:
         """Return the time that the stages ``made`` took by their estimates, at least a half.
 
@@ -213,10 +191,7 @@ class Planner:
         return max(0.5, taken / expected)
 
     def estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
-        """Estimate the cost of ``name`` on this machine from its settings and finished upstream stages."""
-        return self._estimate(name, done).at_pace(self.pace)
-
-    def _estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
+        """Estimate the cost of ``name`` from its settings and finished upstream stages."""
         known = (name, *done)
         if known in self._estimates:
             return self._estimates[known]
@@ -226,7 +201,7 @@ class Planner:
             if upstream in done:
                 inputs[upstream] = self.store.folder(upstream, done[upstream].key)
             else:
-                expected[upstream] = self._estimate(upstream, done)
+                expected[upstream] = self.estimate(upstream, done)
         context = self.context(name, inputs, WorkFolder(self.store.root / "work" / "estimate"))
         self._estimates[known] = stage.estimate(replace(context, expected=expected))
         return self._estimates[known]
@@ -243,7 +218,7 @@ class Planner:
             checkpoints=work.checkpoints,
             cache=self.store.root / "kept" / name,
             seed=self.run.config.seed,
-            device=self.run.device_of(name),
+            device=self.run.device,
             threads=self.threads,
             reporter=self.reporter,
         )

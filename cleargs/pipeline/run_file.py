@@ -55,25 +55,16 @@ class RunSpec:
     store: Path
     """Absolute path of the store."""
     device: Device
-    on_cpu: tuple[str, ...] = ()
-    """Stages that run on the CPU although `device` is the GPU, because its kernels failed there."""
-    falls_back: bool = field(default=False, compare=False)
-    """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
 
     def stages(self, dag: Stages) -> tuple[str, ...]:
         """Return the stages that have work with the settings of the run."""
         idle = {name: getattr(dag.load(name), "idle", None) for name in dag.names}
         return tuple(name for name, check in idle.items() if not (check and check(self.config.effective)))
 
-    def device_of(self, stage: str) -> Device:
-        return "cpu" if stage in self.on_cpu else self.device
-
 
 def write_run_file(run: RunSpec) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError if that is impossible."""
     document: Document = {"input": str(run.source), "device": run.device}
-    if run.on_cpu:
-        document["on_cpu"] = list(run.on_cpu)
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
     document["seed"] = run.config.seed
@@ -128,15 +119,14 @@ class RunMetadata:
     source: Path | None = None
     store: Path | None = None
     device: Device | None = None
-    on_cpu: tuple[str, ...] = ()
     damaged: bool = False
-    """True if input, store, device or on_cpu is invalid."""
+    """True if input, store or device is invalid."""
 
 
 def read_metadata(folder: Path) -> RunMetadata:
     """Return the content of ``run.toml`` in ``folder``, or empty metadata if there is none.
 
-    An invalid input, store, device or on_cpu does not hide the others. Raises ConfigError if the file is not
+    An invalid input, store or device does not hide the others. Raises ConfigError if the file is not
     valid TOML, and StoreError like `check_links`.
     """
     if not (folder / RUN_FILE).is_file():
@@ -152,10 +142,7 @@ def read_metadata(folder: Path) -> RunMetadata:
     device = given["device"] if given["device"] in ("cpu", "cuda") else None
     read = {*paths, *(["device"] if device else [])}
     damaged = any(value not in (None, "") and name not in read for name, value in given.items())
-    on_cpu = document.pop("on_cpu", [])
-    if not isinstance(on_cpu, list) or not all(isinstance(name, str) for name in on_cpu):
-        on_cpu, damaged = [], True
-    return RunMetadata(document, paths.get("input"), paths.get("store"), device, tuple(on_cpu), damaged)
+    return RunMetadata(document, paths.get("input"), paths.get("store"), device, damaged)
 
 
 def require_store(folder: Path, metadata: RunMetadata) -> None:
@@ -209,8 +196,7 @@ def read_run_file(
     if place == metadata.store:
         require_store(folder, metadata)
     place = checked_store(folder, place)
-    on_cpu, chosen = (metadata.on_cpu, metadata.device) if device is None else ((), device)
-    return RunSpec(folder, metadata.source, config, place, chosen or "cpu", on_cpu, device is None)
+    return RunSpec(folder, metadata.source, config, place, device or metadata.device or "cpu")
 
 
 def damaged_run_file(folder: Path) -> ConfigError:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from filecmp import cmp
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Any, Literal
 
 from cleargs.digest import file_digest, tree_digest
 from cleargs.errors import CleargsError, InputError, StageError, StoreError
@@ -44,9 +44,11 @@ from cleargs.pipeline.plan import (
     rerun_lines,
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, known_metadata, write_run_file
+from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Entry, Spent, Store, copied_key
 from cleargs.progress import WarningsOnly
+from cleargs.timing import cpu_seconds, recorded
 
 BUSY = 1.5
 """Time by the clock divided by processor time from which other programs are named as the cause."""
@@ -82,7 +84,8 @@ class Runner(Planner):
                 self.dag.load(plan.stage).preflight(self.run.config.effective[plan.stage])
         check_address_space(plans)
         check_disk(plans, self.store.root)
-        plans = self.at_measured_pace(plans)
+        if self.run.device == "cpu":
+            self.dag.prepare([plan.stage for plan in plans if plan.state != "done"])
         for line in (*rerun_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)
@@ -101,7 +104,6 @@ class Runner(Planner):
                 outcomes.append(outcome)
                 if outcome.how == "made":
                     self._unlink_outdated()
-                if outcome.how == "made":
                     made[name] = outcome.manifest
                     self._revise([plan for plan in plans if plan.stage not in done], done, made)
                 if outcome.manifest.status == "partial" and not allow_partial:
@@ -162,38 +164,7 @@ class Runner(Planner):
             self.reporter.info(f"new {line}{note if busy else ''}")
 
     def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
-        """Find or make the results of ``name``, and link them into the run folder.
-
-        If the kernels of the GPU fail and the run may fall back, the stage starts again on the CPU.
-        """
-        try:
-            return self._find_or_make_on_device(name, done, forced=forced)
-        except Exception as error:
-            fault = self.dag.gpu_fault(error) if self.run.device_of(name) == "cuda" else None
-            if fault is None or (isinstance(error, CleargsError) and not self.run.falls_back):
-                raise
-            if not self.run.falls_back:
-                raise StageError(
-                    f"{name}: the GPU failed ({fault})",
-                    hint="test the GPU with cleargs doctor --gpu, or run on the CPU with --device cpu",
-                ) from error
-        # Outside the except block, so that the traceback holds no memory of the GPU.
-        self._leave_gpu(name, fault)
-        return self._find_or_make_on_device(name, done, forced=forced)
-
-    def _leave_gpu(self, name: str, fault: str) -> None:
-        """Let ``name`` and the stages after it run on the CPU, now and in later calls."""
-        stages = self.dag.names[self.dag.names.index(name) :]
-        self.reporter.warn(
-            f"{name}: the GPU failed ({fault}); {', '.join(stages)} run on the CPU, {name} from its start. "
-            "Finished stages are kept. Try the GPU again with --device cuda"
-        )
-        self.run = replace(self.run, on_cpu=stages)
-        write_run_file(self.run)
-
-    def _find_or_make_on_device(
-        self, name: str, done: Mapping[str, Manifest], *, forced: bool
-    ) -> StageOutcome:
+        """Find or make the results of ``name``, and link them into the run folder."""
         stage_key = self.stage_key(name, done)
         entry = self.store.find(name, stage_key.parts.key)
         manifest = entry.complete if entry is not None and not forced else None
@@ -252,7 +223,8 @@ class Runner(Planner):
         drop_links(context.cache, in_place=context.cache)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         shown = self.reporter if self._has_work(name) else WarningsOnly(self.reporter)
-        with recorded_progress(shown, self.run.folder, name, work.folder) as reporter:
+        progress = recorded_progress(shown, self.run.folder, name, work.folder)
+        with recorded() as times, progress as reporter:
 
             def spent() -> Spent:
                 compiling = reporter.compile_seconds
@@ -261,7 +233,7 @@ class Runner(Planner):
                 )
 
             try:
-                result = stage.run(replace(context, reporter=reporter))
+                result = self._run_stage(name, replace(context, reporter=reporter))
             except BaseException:  # also when interrupted: the time counts when the stage resumes
                 work.note_spent(spent())
                 raise
@@ -271,6 +243,7 @@ class Runner(Planner):
             "compile_seconds": round(took.compiling, 3),
             "cpu_seconds": round(took.processor, 3),
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
+            "timing": times.rows(),
         }
         now = self.external_digests(name)
         if now != {role: stage_key.origins[role] for role in now}:
@@ -303,7 +276,7 @@ class Runner(Planner):
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
             started=started.isoformat(timespec="seconds"),
-            device=self.run.device_of(name),
+            device=self.run.device,
             summary=plain_json(result.summary),
             **cost,
         )
@@ -317,6 +290,19 @@ class Runner(Planner):
                 self.reporter.warn(f"{name}: the new results have other digests than before{why}")
         # An equal result that was already there keeps its manifest; the outcome has the cost of this attempt.
         return published.model_copy(update=cost)
+
+    def _run_stage(self, name: str, context: StageContext[Any]) -> StageResult:
+        """Run the stage ``name``. Raises StageError, with one line about the cause, if the GPU fails."""
+        try:
+            return self.dag.load(name).run(context)
+        except Exception as error:
+            fault = self.dag.gpu_fault(error) if context.device == "cuda" else None
+            if fault is None or isinstance(error, CleargsError):
+                raise
+            raise StageError(
+                f"{name}: the GPU failed ({fault})",
+                hint="test the GPU with cleargs doctor --gpu, or run on the CPU with --device cpu",
+            ) from error
 
     def _with_inherited(self, manifest: Manifest, inherited: tuple[str, ...]) -> Manifest:
         """Return ``manifest`` with the present list of outputs that are missing upstream.
@@ -363,12 +349,12 @@ class Usage:
     def __init__(self) -> None:
         with suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")  # resets the peak (man 5 proc)
-        self._cpu_seconds, self._peak_of_children = _cpu_seconds(), _peak(resource.RUSAGE_CHILDREN)
+        self._cpu_seconds, self._peak_of_children = cpu_seconds(), _peak(resource.RUSAGE_CHILDREN)
 
     @property
     def cpu_seconds(self) -> float:
         """Processor time of all threads and of ended child processes, in seconds."""
-        return _cpu_seconds() - self._cpu_seconds
+        return cpu_seconds() - self._cpu_seconds
 
     @property
     def peak_memory_gb(self) -> float:
@@ -378,11 +364,6 @@ class Usage:
             if found := re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text()):
                 own = int(found[1]) * 1024
         return max(own, children if children > self._peak_of_children else 0) / 1e9
-
-
-def _cpu_seconds() -> float:
-    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(used.ru_utime + used.ru_stime for used in both)
 
 
 def _peak(who: int) -> int:

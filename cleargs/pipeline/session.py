@@ -160,7 +160,6 @@ def resolve_run(
     if root == metadata.store:
         require_store(folder, metadata)
     root = checked_store(folder, root)
-    keeps = device == "auto" and metadata.device is not None
     chosen = resolve_device(device, reporter.info, kept=metadata.device, test=test_gpu)
     if kept is not None:
         own = [f"seed={kept.seed}"] if kept.seed else []
@@ -169,5 +168,4 @@ def resolve_run(
             reporter.info(
                 f"settings kept from {folder / RUN_FILE}: {listed(own)}; --reset starts from the recipe"
             )
-    on_cpu = metadata.on_cpu if keeps else ()
-    return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")
+    return RunSpec(folder, source.absolute(), config, root, chosen)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from importlib import import_module
 from typing import cast
 
 from cleargs.errors import InputError, did_you_mean
 from cleargs.pipeline.stage import Stage
-from cleargs.progress import Say
 
 
 @dataclass(frozen=True)
@@ -19,11 +18,8 @@ class Stages:
     names: tuple[str, ...]
     load: Callable[[str], Stage]
     """Load a stage by name."""
-    pace: Callable[[Say | None], float] = lambda say: 1.0
-    """Return the time on this machine divided by the time on the machine that the estimates were made for.
-
-    With ``say``, the pace is measured unless it is known, which takes seconds, and ``say`` announces it.
-    """
+    prepare: Callable[[Collection[str]], None] = lambda names: None
+    """Start what the stages ``names`` will need on the CPU, next to those before them."""
     gpu_fault: Callable[[BaseException], str | None] = lambda error: None
     """Return one line about the GPU failure that caused an error; None if the GPU is not the cause."""
 
@@ -44,7 +40,7 @@ class Stages:
 def installed() -> Stages:
     """Return the stages of the package ``cleargs.stages``. A module is imported when it is first used."""
     package = import_module("cleargs.stages")
-    return Stages(tuple(package.STAGES), load_stage, package.pace, package.gpu_fault)
+    return Stages(tuple(package.STAGES), load_stage, package.prepare, package.gpu_fault)
 
 
 def load_stage(name: str) -> Stage:

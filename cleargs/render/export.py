@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,28 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Similarity, upright
-from cleargs.capture.model import read_model, transform_model, write_model
 from cleargs.capture.summary import IngestSummary
-from cleargs.capture.tables import load_frames, load_points
-from cleargs.digest import named_files
+from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
-from cleargs.files import disk_errors, write_bytes, write_json
+from cleargs.files import disk_errors, write_json
 from cleargs.manifest import linked_manifest
-from cleargs.named_views import NamedView, read_views
+from cleargs.named_views import read_views
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
+from cleargs.render.sidecars import stem, views_json, write_sidecars
 from cleargs.run_results import edited_scene, scene_path
 from cleargs.scene.views import camera_of
-from cleargs.splat.camera import Camera, cameras_json
+from cleargs.splat.camera import Camera
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.spz import SpzVersion
 from cleargs.splat.transforms import UP, far_offset, orient_up, transform_scene
-
-MODEL = "colmap/sparse/0"
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,7 @@ def export_scene(
         scene = padded(scene, options.sh_degree)
     if options.world == "input" and (offset := far_offset(scene.gaussians, similarity)):
         similarity["translation"] = similarity["translation"] - np.array(offset)
-        file = outputs[0].with_name(f"{_stem(outputs[0])}.offset.json")
+        file = outputs[0].with_name(f"{stem(outputs[0])}.offset.json")
         check_outputs([file], installed(), run, force=options.force)
         write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
         messages.append(
@@ -102,9 +98,9 @@ def export_scene(
         scene = transform_scene(scene, **similarity)
     scene, cropped = _cropped(scene, options)
     for output in outputs if options.cameras else ():
-        _write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
+        write_sidecars(output, ingest, list(cameras.values()), similarity, force=options.force)
     if options.views and (views := read_views(run)):
-        file = outputs[0].with_name(f"{_stem(outputs[0])}.views.json")
+        file = outputs[0].with_name(f"{stem(outputs[0])}.views.json")
         check_outputs([file], installed(), run, force=options.force)
         write_json(file, views_json(views, next(iter(cameras.values()))[1], **similarity))
         messages.append(f"{file}: {len(views)} views")
@@ -215,10 +211,6 @@ def _write(
     return messages
 
 
-def _stem(output: Path) -> str:
-    return output.name[: -len(format_of(output)) - 1]
-
-
 def _similarity(
     ingest: Path, cameras: Mapping[int, tuple[str, Camera]], options: ExportOptions
 ) -> dict[str, Any]:
@@ -254,59 +246,3 @@ def _similarity(
         factor = wanted / (apart * similarity["scale"])
         similarity |= {name: factor * similarity[name] for name in ("scale", "translation")}
     return similarity
-
-
-def views_json(
-    views: Sequence[NamedView],
-    camera: Camera,
-    scale: float = 1.0,
-    rotation: NDArray[np.float64] | None = None,
-    translation: NDArray[np.float64] | None = None,
-) -> list[dict[str, Any]]:
-    """Return name, position, target, up and horizontal field of view (degrees, of ``camera``) of each view.
-
-    They are in the world of the file: x -> scale rotation x + translation.
-    """
-    turn = np.eye(3) if rotation is None else rotation
-    shift = np.zeros(3) if translation is None else translation
-    fov = float(np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx)))
-    return [
-        {
-            "name": view.name,
-            "position": (scale * turn @ view.position + shift).tolist(),
-            "target": (scale * turn @ view.target + shift).tolist(),
-            "up": (turn @ [0.0, -1.0, 0.0]).tolist(),
-            "fov": fov,
-        }
-        for view in views
-    ]
-
-
-def _write_sidecars(
-    output: Path,
-    ingest: Path,
-    cameras: Sequence[tuple[str, Camera]],
-    similarity: Mapping[str, Any],
-    *,
-    force: bool,
-) -> None:
-    """Write cameras and COLMAP model next to ``output``. Equal files of an earlier export are kept.
-
-    Raises InputError if a file of another content exists.
-    """
-    sparse = read_model(ingest / MODEL)
-    with tempfile.TemporaryDirectory() as name:
-        made = Path(name)
-        write_json(made / f"{_stem(output)}.cameras.json", cameras_json(cameras, **similarity))
-        moved = transform_model(sparse, **similarity) if similarity else sparse
-        write_model(made / f"{_stem(output)}.colmap/sparse/0", moved, load_points(ingest).rgb)
-        for inside, file in named_files(made).items():
-            target, content = output.parent / inside, file.read_bytes()
-            if target.is_file() and target.read_bytes() != content and not force:
-                raise InputError(
-                    f"{target} exists already, of another export", hint="choose another name, or give --force"
-                )
-            check_outputs([target], installed(), ingest.parent)
-            with disk_errors(target):
-                target.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(target, content)  # replaces a link, and does not write through it

@@ -2,41 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from shlex import quote
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
-from markupsafe import Markup
-from rich.filesize import decimal
-
-import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder, write_bytes
-from cleargs.manifest import plain_json
 from cleargs.named_views import read_views
-from cleargs.pipeline.config import Config
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.program import program
-from cleargs.report.advice import command, shown_advice, toml_text
-from cleargs.report.formatting import duration
-from cleargs.report.frames import (
-    MEANINGS,
-    SCENES,
-    FrameRow,
-    faults_of,
-    load_rows,
-    scene_with_models,
-    scores_of,
-    worst_cue,
-)
+from cleargs.report.advice import command, shown_advice
+from cleargs.report.frames import MEANINGS, SCENES, FrameRow, load_rows, scene_with_models
+from cleargs.report.html import page_html
 from cleargs.report.outcome import LOOSE_DB, outcome
-from cleargs.report.pictures import LAYERS, FramePictures, write_jpeg, write_pictures
+from cleargs.report.page_data import changed_settings, frame_data, training_curves
+from cleargs.report.pictures import LAYERS, write_jpeg, write_pictures
 from cleargs.report.report_json import (
     ENTRY,
     PAGE,
@@ -48,44 +29,14 @@ from cleargs.report.report_json import (
 )
 from cleargs.report.single_file import single_file_size
 from cleargs.report.web_scene import LICENCE, opening_frame, viewer_data, write_scene, write_viewer
-from cleargs.rivr.candidates import phrase_of
 from cleargs.run_results import edited_scene
 from cleargs.scene.folder import SCENE, SceneFolder
 from cleargs.scene.views import camera_of
 from cleargs.splat.backend import set_threads
 from cleargs.splat.render import Viewer
 from cleargs.splat.scene import Scene
-from cleargs.splat.tables import TRAIN
 
 _STILL = 960  # long side of the image that is shown until the 3D viewer has loaded, px
-
-
-def page_html(template: str | Template, **values: Any) -> bytes:
-    """Render ``template``, or the template of the report with this name. The values are escaped."""
-    return page_environment().get_template(template).render(version=cleargs.__version__, **values).encode()
-
-
-def json_in_html(value: Any) -> Markup:
-    """Return ``value`` as JSON without characters that could end its script element."""
-    text = json.dumps(plain_json(value), ensure_ascii=True, separators=(",", ":"))
-    for letter in "<>&":
-        text = text.replace(letter, f"\\u{ord(letter):04x}")
-    return Markup(text)
-
-
-def page_environment() -> Environment:
-    """Return the Jinja environment of the report's templates, with their filters and globals."""
-    environment = Environment(
-        loader=PackageLoader("cleargs.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    static = files("cleargs.report").joinpath("static")
-    environment.filters |= {"json": json_in_html, "duration": duration, "bytes": decimal, "shell": quote}
-    environment.globals["static"] = lambda name: Markup(static.joinpath(name).read_text(encoding="utf-8"))
-    return environment
 
 
 def write_report(planner: Planner, edited: Path | None = None) -> Path:
@@ -192,79 +143,3 @@ def _write_scene(
         "bytes": (run / stage / SCENE).stat().st_size,
     }
     return data, renderer
-
-
-def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
-    """Return name, value, default and meaning of each setting that differs from its default."""
-    return [
-        (setting.name, toml_text(value), toml_text(setting.default), setting.meaning)
-        for setting, value in config.settings()
-        if value != setting.default
-    ]
-
-
-def frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> dict[str, Any]:
-    """Return the data of a frame for the page; ``time`` is its time in the viewer's animation, in seconds."""
-    repair, why, scores = "none tried", "", {}
-    if row.selection:
-        choice = phrase_of(row.selection.chosen)
-        refused = row.selection.chosen != "observed" and not row.chosen
-        repair = f"kept as filmed, since {choice} was refused" if refused else choice
-        scores = dict(scores_of(row.selection))
-        why = row.selection.reason
-    found = {
-        "blur, px": row.motion("blur_px"),
-        "rolling shutter, px": row.motion("skew_px"),
-        "defocus, px": row.formation.get("defocus_px"),
-        "exposure, stops": row.gain_ev,
-        "camera speed, px per video frame": row.speed_px,
-    }
-    return {
-        "id": row.frame.frame_id,
-        "name": row.frame.name,
-        "role": row.role,
-        "weight": row.weight,
-        "weight_text": row.weight_text,
-        "psnr": row.psnr if pictures.psnr is None else pictures.psnr,
-        "figures": {name: row.rated[name] for name in "RBGCDOZ" if row.rated.get(name) is not None},
-        "worst": worst_cue(row.rated),
-        "cues": dict(sorted(faults_of(row.rated).items(), key=lambda item: -item[1])),  # the worst first
-        "repair": repair,
-        "why": why,
-        "chosen": row.chosen,
-        "scores": scores,
-        "found": {name: value for name, value in found.items() if value is not None},
-        "formation": row.formation,
-        "layers": {name: picture.path for name, picture in pictures.layers.items()},
-        "time": time,
-    }
-
-
-_POINTS = 120  # maximum number per curve
-
-
-def training_curves(run: Path, stages: Sequence[str]) -> dict[str, Any] | None:
-    """Return loss, PSNR and number of Gaussians over the training steps; None before the first step.
-
-    Loss and PSNR are those of steps on raw frames. They are medians over equal intervals: each step shows one
-    view, and views differ more than steps. Raises StoreError if a table cannot be read.
-    """
-    logs = {stage: SceneFolder(run / stage).log() for stage in stages}
-    tables = {stage: log for stage, log in logs.items() if log is not None}
-    steps = pa.concat_tables([TRAIN.empty_table(), *tables.values()])
-    real = np.array(steps["kind"].to_pylist()) == "real"
-    if not real.any():
-        return None
-    curves: list[dict[str, Any]] = []
-    for title, unit, name, digits in (
-        ("PSNR on training frames", "dB", "psnr", 1),
-        ("Loss", "", "loss", 3),
-        ("Gaussians", "", "n_gaussians", 0),
-    ):
-        values = steps[name].to_numpy().astype(np.float64)
-        known = np.flatnonzero(real & np.isfinite(values))
-        intervals = np.array_split(known, min(_POINTS, max(1, len(known) // 6)))
-        points = [(float(part.mean()), float(np.median(values[part]))) for part in intervals]
-        curves.append({"title": title, "unit": unit, "digits": digits, "points": points})
-    starts = np.cumsum([0, *(table.num_rows for table in tables.values())]).tolist()
-    return {"steps": len(real), "parts": list(zip(tables, starts, strict=False)), "curves": curves}

@@ -14,8 +14,8 @@ from cleargs.splat.densifier import load_densifier
 if TYPE_CHECKING:
     from cleargs.splat.views import TrainingView
 
-# Wall seconds of a step on two idle cores of the reference machine (`cleargs.splat.pace`): a constant, and
-# the parts that grow with the image and with the number of Gaussians.
+# Wall seconds of a step on two idle cores of an Intel Xeon (Emerald Rapids, AVX-512): a constant, and the
+# parts that grow with the image and with the number of Gaussians.
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
 # Wall seconds per megapixel to estimate a frame's image formation: for the first time, under the assumption
 # that half of the frames are searched, and for later times.

@@ -57,6 +57,7 @@ def test_all_workflow_files_are_installed() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @needs_snakemake
 def test_a_bad_scene_does_not_stop_the_others(toys: ToyBatch) -> None:
     (toys.root / "barn" / "11.txt").write_text("no number")
@@ -96,6 +97,7 @@ def slurm(cluster: Slurm) -> Iterator[Slurm]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @needs_snakemake
 @pytest.mark.skipif(bool(LACKING), reason=f"Slurm is not installed: {', '.join(LACKING)}")
 def test_time_limit_and_lost_node_cost_no_finished_work(toys: ToyBatch, slurm: Slurm) -> None:

@@ -21,7 +21,7 @@ from benchmarks.speed.oracle import (
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.pace import random_scene
+from cleargs.splat.random_scene import random_scene
 
 SPLATS, WIDTH, HEIGHT = 90, 45, 33
 PIXELS = torch.tensor([3, 47, 500, 501, 733, 1200, 1484])

@@ -12,7 +12,7 @@ from benchmarks.speed.torch_tiles import TILE, groups, pixel_centres, rasterise,
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.pace import random_scene
+from cleargs.splat.random_scene import random_scene
 
 WIDTH, HEIGHT = 45, 35
 

@@ -19,7 +19,7 @@ from cleargs.splat import constants
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.backend import warm_up
 from cleargs.splat.kernels.cpu.simd import LANES
-from cleargs.splat.pace import random_scene
+from cleargs.splat.random_scene import random_scene
 
 
 def test_contributions_match_the_oracle():

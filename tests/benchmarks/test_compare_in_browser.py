@@ -11,7 +11,7 @@ from helpers.chromium import CHROMIUM, NO_CHROMIUM, SIZES, Opened, check_page
 
 from benchmarks.comparison.page import write_comparison
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 
 @pytest.fixture(scope="module")

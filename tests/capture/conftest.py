@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,9 +50,11 @@ class Ingested:
 Ingest = Callable[..., Ingested]
 
 
-@pytest.fixture
-def ingest(tmp_path: Path) -> Ingest:
-    """Run the stage: ``ingest(source, name, threads=1, **settings)``."""
+def ingest_in(tmp_path: Path, cache: Path | None = None) -> Ingest:
+    """Return a function that runs the stage in a folder: ``ingest(source, name, threads=1, **settings)``.
+
+    ``cache`` is the folder of the models that ingest has found before (None: one below ``tmp_path``).
+    """
 
     def run(source: Path, name: str = "out", *, threads: int = 1, **settings: Any) -> Ingested:
         out, work = tmp_path / name, tmp_path / f"{name}.work"
@@ -66,7 +69,7 @@ def ingest(tmp_path: Path) -> Ingest:
             externals={},
             out=out,
             checkpoints=work,
-            cache=tmp_path / "kept",
+            cache=cache or tmp_path / "kept",
             seed=0,
             device="cpu",
             threads=threads,
@@ -76,6 +79,12 @@ def ingest(tmp_path: Path) -> Ingest:
         return Ingested(out, stage.run(context), reporter.warnings, reporter.infos)
 
     return run
+
+
+@pytest.fixture
+def ingest(tmp_path: Path) -> Ingest:
+    """Run the stage: see `ingest_in`."""
+    return ingest_in(tmp_path)
 
 
 def camera_to_world(count: int) -> list[NDArray[np.float64]]:
@@ -133,9 +142,8 @@ def frames() -> list[tuple[NDArray[np.float64], NDArray[np.uint8]]]:
     return [(pose, render(pose)) for pose in camera_to_world(10)]
 
 
-@pytest.fixture
-def images(tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]) -> Path:
-    """A folder of images alone."""
+def images_in(tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]) -> Path:
+    """Write a folder of images alone."""
     folder = tmp_path / "images-only"
     folder.mkdir()
     for index, (_, image) in enumerate(frames):
@@ -144,14 +152,49 @@ def images(tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.ui
 
 
 @pytest.fixture
-def posed(tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]) -> Path:
-    """A folder with images/ and transforms.json."""
+def images(tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]) -> Path:
+    """A folder of images alone."""
+    return images_in(tmp_path, frames)
+
+
+@pytest.fixture(scope="session")
+def placed(
+    tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]
+) -> Ingested:
+    """Results of the folder `images` with the settings of `ingest`, made once. Tests only read them."""
+    folder = tmp_path_factory.mktemp("placed")
+    return ingest_in(folder)(images_in(folder, frames))
+
+
+def posed_in(tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]) -> Path:
+    """Write a folder with images/ and transforms.json."""
     folder = tmp_path / "posed"
     (folder / "images").mkdir(parents=True)
     for index, (_, image) in enumerate(frames):
         cv2.imwrite(str(folder / "images" / f"{index:03d}.png"), image)
     write_transforms(folder, [pose for pose, _ in frames])
     return folder
+
+
+@pytest.fixture
+def posed(tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]) -> Path:
+    """A folder with images/ and transforms.json."""
+    return posed_in(tmp_path, frames)
+
+
+@pytest.fixture(scope="session")
+def made(
+    tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]]
+) -> Ingested:
+    """Results of the folder `posed` with the settings of `ingest`, made once. Tests only read them."""
+    folder = tmp_path_factory.mktemp("made")
+    return ingest_in(folder)(posed_in(folder, frames))
+
+
+@pytest.fixture
+def first(made: Ingested, tmp_path: Path) -> Path:
+    """A copy of the results of `made`, which the test may change."""
+    return Path(shutil.copytree(made.out, tmp_path / "first"))
 
 
 def write_transforms(folder: Path, poses: list[NDArray[np.float64]], **extra: Any) -> None:

@@ -114,8 +114,8 @@ def test_nothing_there(tmp_path: Path) -> None:
         open_capture(tmp_path / "nowhere", IngestConfig())
 
 
-def test_damaged_colmap_model(posed: Path, ingest: Ingest) -> None:
-    project = ingest(posed, "first").out
+def test_damaged_colmap_model(first: Path) -> None:
+    project = first
     sparse = project / "colmap" / "sparse" / "0"
     whole = {path: path.read_bytes() for path in sparse.iterdir()}
     for path, data in whole.items():
@@ -221,14 +221,13 @@ def test_json_that_is_nested_too_deeply(posed: Path) -> None:
     assert refused(caught)
 
 
-def test_points_that_are_not_finite_are_left_out(posed: Path, ingest: Ingest) -> None:
-    project = ingest(posed, "first").out
-    model = project / "colmap" / "sparse" / "0"
+def test_points_that_are_not_finite_are_left_out(first: Path, ingest: Ingest) -> None:
+    model = first / "colmap" / "sparse" / "0"
     points = bytearray((model / "points3D.bin").read_bytes())
     for value in (float("nan"), 1e300):  # for x of the first point, then y
         struct.pack_into("<d", points, 16, value)
         (model / "points3D.bin").write_bytes(points)
-        again = ingest(project, f"again {value}")
+        again = ingest(first, f"again {value}")
         assert any("1 points of the input's sparse model" in line for line in again.warnings)
         table = load_points(again.out)
         assert len(table.xyz) and np.isfinite(table.xyz).all() and np.abs(table.xyz).max() < 1e9
@@ -237,7 +236,7 @@ def test_points_that_are_not_finite_are_left_out(posed: Path, ingest: Ingest) ->
         struct.pack_into("<d", points, at + 8, float("nan"))
         at += 51 + 8 * struct.unpack_from("<Q", points, at + 43)[0]
     (model / "points3D.bin").write_bytes(points)
-    again = ingest(project, "none")
+    again = ingest(first, "none")
     assert any(f"{count} points of the input's sparse model" in line for line in again.warnings)
     assert len(load_points(again.out).xyz)
 

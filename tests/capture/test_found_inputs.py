@@ -22,14 +22,24 @@ from cleargs.media.encode import write_video
 from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
 
-from .conftest import Ingest, camera_to_world, texture
+from .conftest import Ingest, Ingested, camera_to_world, ingest_in, texture
 from .test_data_sets import poses_bounds
 
 
+@pytest.fixture(scope="module")
+def found_before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Models of all tests of this file: inputs with the same pictures, poses and points are placed once."""
+    return tmp_path_factory.mktemp("kept")
+
+
 @pytest.fixture
-def project(posed: Path, ingest: Ingest, tmp_path: Path) -> Path:
+def ingest(tmp_path: Path, found_before: Path) -> Ingest:
+    return ingest_in(tmp_path, found_before)
+
+
+@pytest.fixture
+def project(made: Ingested, tmp_path: Path) -> Path:
     """A COLMAP project of ten images: ``images/`` and ``sparse/0``."""
-    made = ingest(posed, "made")
     folder = tmp_path / "project"
     shutil.copytree(made.out / "images", folder / "images")
     shutil.copytree(made.out / "colmap/sparse", folder / "sparse")

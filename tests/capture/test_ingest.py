@@ -16,7 +16,7 @@ from cleargs.capture.model import read_model, write_model
 from cleargs.capture.tables import Frame, load_frames, load_observations, load_points
 from cleargs.errors import InputError, StageError
 
-from .conftest import FOCAL, HEIGHT, PLANES, WIDTH, Ingest, camera_to_world, write_transforms
+from .conftest import FOCAL, HEIGHT, PLANES, WIDTH, Ingest, Ingested, camera_to_world, write_transforms
 
 TABLES = ("frames.parquet", "points.parquet", "observations.parquet")
 
@@ -55,10 +55,9 @@ def errors_of_poses(out: Path) -> tuple[float, float]:
     return float(np.degrees(max(turns))), float(np.linalg.norm(placed - b, axis=1).max())
 
 
-def test_given_poses_give_true_points(posed: Path, ingest: Ingest) -> None:
-    done = ingest(posed)
-    frames, points = load_frames(done.out), load_points(done.out)
-    summary = done.result.summary
+def test_given_poses_give_true_points(made: Ingested) -> None:
+    frames, points = load_frames(made.out), load_points(made.out)
+    summary = made.result.summary
     assert summary["poses"] == "given" and summary["registered"] == len(frames) == 10
     assert summary["given_poses_missed_px"] < 0.5
     centres = np.stack([pose_of(frame).centre for frame in frames])
@@ -76,8 +75,8 @@ def test_given_poses_give_true_points(posed: Path, ingest: Ingest) -> None:
     assert len(points.xyz) > 200 and np.median(distance) < 0.01 and np.quantile(distance, 0.9) < 0.05
 
 
-def test_observations_point_at_what_they_see(posed: Path, ingest: Ingest) -> None:
-    done = ingest(posed)
+def test_observations_point_at_what_they_see(made: Ingested) -> None:
+    done = made
     frames, points = load_frames(done.out), load_points(done.out)
     frame_ids, point_ids = load_observations(done.out)
     assert len(set(zip(frame_ids.tolist(), point_ids.tolist(), strict=True))) == len(frame_ids)
@@ -107,9 +106,13 @@ def test_observations_point_at_what_they_see(posed: Path, ingest: Ingest) -> Non
 
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 1e6), (1e4, 0.0), (1e-4, 0.0)])
 def test_the_input_world_does_not_matter(
-    posed: Path, ingest: Ingest, frames: list[tuple[np.ndarray, np.ndarray]], scale: float, shift: float
+    posed: Path,
+    made: Ingested,
+    ingest: Ingest,
+    frames: list[tuple[np.ndarray, np.ndarray]],
+    scale: float,
+    shift: float,
 ) -> None:
-    plain = ingest(posed, "plain")
     moved = []
     for pose, _ in frames:
         matrix = pose.copy()
@@ -117,16 +120,16 @@ def test_the_input_world_does_not_matter(
         moved.append(matrix)
     write_transforms(posed, moved)
     other = ingest(posed, "moved")
-    for one, two in zip(load_frames(plain.out), load_frames(other.out), strict=True):
+    for one, two in zip(load_frames(made.out), load_frames(other.out), strict=True):
         assert np.allclose(pose_of(one).rotation, pose_of(two).rotation, atol=1e-5)
         assert np.allclose(pose_of(one).translation, pose_of(two).translation, atol=1e-5)
-    first, second = load_points(plain.out), load_points(other.out)
+    first, second = load_points(made.out), load_points(other.out)
     assert np.array_equal(first.point_id, second.point_id)
     assert np.allclose(first.xyz, second.xyz, rtol=1e-5, atol=1e-5)
     assert np.array_equal(first.rgb, second.rgb)
     assert all(
         np.array_equal(a, b)
-        for a, b in zip(load_observations(plain.out), load_observations(other.out), strict=True)
+        for a, b in zip(load_observations(made.out), load_observations(other.out), strict=True)
     )
 
 
@@ -208,10 +211,9 @@ def test_a_sparse_model_of_bad_poses_is_adjusted_too(shaken: Path, ingest: Inges
     assert errors_of_poses(second.out)[0] < 0.1
 
 
-def test_errors_that_a_sparse_model_states_are_not_believed(posed: Path, ingest: Ingest) -> None:
+def test_errors_that_a_sparse_model_states_are_not_believed(first: Path, ingest: Ingest) -> None:
     """A program changed the camera afterwards. COLMAP stores errors and does not renew them."""
-    first = ingest(posed, "first")
-    folder = first.out / "colmap/sparse/0"
+    folder = first / "colmap/sparse/0"
     model = read_model(folder)
     assert 0 < np.median(model.error) < 0.6 and np.median(model.misses()) < 0.6
     cameras = {
@@ -220,7 +222,7 @@ def test_errors_that_a_sparse_model_states_are_not_believed(posed: Path, ingest:
     }
     write_model(folder, replace(model, cameras=cameras), np.zeros((len(model.point_ids), 3), np.uint8))
     assert np.median(read_model(folder).error) < 0.6 < np.median(read_model(folder).misses())
-    kept, adjusted = ingest(first.out, "kept"), ingest(first.out, "adjusted", refine_above=0.3)
+    kept, adjusted = ingest(first, "kept"), ingest(first, "adjusted", refine_above=0.3)
     assert [done.result.summary["kind"] for done in (kept, adjusted)] == ["colmap", "colmap"]
     # 0.6 px is less than what other points miss at this camera. They replace those of the input.
     assert kept.result.summary["poses"] == "given"
@@ -230,23 +232,22 @@ def test_errors_that_a_sparse_model_states_are_not_believed(posed: Path, ingest:
     assert all(abs(frame.fx / FOCAL - 1) < 0.02 for frame in load_frames(adjusted.out))
 
 
-def test_a_sparse_model_keeps_its_points_where_other_poses_are_no_better(posed: Path, ingest: Ingest) -> None:
-    first = ingest(posed, "first")
-    second = ingest(first.out, "second", refine_above=0, max_features=512)  # would triangulate fewer points
+def test_a_sparse_model_keeps_its_points_where_other_poses_are_no_better(
+    made: Ingested, ingest: Ingest
+) -> None:
+    second = ingest(made.out, "second", refine_above=0, max_features=512)  # would triangulate fewer points
     assert second.result.summary["poses"] == "given"
-    one, two = load_points(first.out), load_points(second.out)
+    one, two = load_points(made.out), load_points(second.out)
     assert np.array_equal(one.point_id, two.point_id) and np.allclose(one.xyz, two.xyz, atol=1e-9)
 
 
-def test_sfm_finds_the_arc(images: Path, ingest: Ingest) -> None:
+def test_sfm_finds_the_arc(images: Path, placed: Ingested, ingest: Ingest) -> None:
     done = ingest(images, "sfm", threads=2)
     frames = load_frames(done.out)
     assert [frame.name for frame in frames] == [f"view{index}.png" for index in range(10)]
     assert done.result.summary["poses"] == "sfm" and all(frame.registered for frame in frames)
     assert errors_of_poses(done.out)[1] < 0.05  # the arc is 2.4 long
-
-    again = ingest(images, "again", threads=1)
-    assert same_bytes(done.out, again.out)
+    assert same_bytes(done.out, placed.out), "on one thread"
 
 
 def test_sequential_matching_is_reproducible(images: Path, ingest: Ingest) -> None:
@@ -265,17 +266,16 @@ def test_poses_can_be_ignored(posed: Path, ingest: Ingest) -> None:
         ingest(posed, "auto")
 
 
-def test_own_result_is_a_colmap_project(posed: Path, ingest: Ingest) -> None:
-    first = ingest(posed, "first")
-    (first.out / "images" / "999.png").write_bytes((first.out / "images" / "000003.png").read_bytes())
-    second = ingest(first.out, "second")
+def test_own_result_is_a_colmap_project(first: Path, ingest: Ingest) -> None:
+    (first / "images" / "999.png").write_bytes((first / "images" / "000003.png").read_bytes())
+    second = ingest(first, "second")
     frames = load_frames(second.out)
     assert second.result.summary["kind"] == "colmap"
     # An image that the model does not know stays in the table, unregistered, with the shared camera.
     assert [frame.registered for frame in frames] == [True] * 10 + [False]
     assert [frame.placed for frame in frames] == ["given"] * 10 + ["no pose in the input"]
     assert frames[-1].qw is None and frames[-1].n_points == 0 and frames[-1].fx == frames[0].fx
-    one, two = load_points(first.out), load_points(second.out)
+    one, two = load_points(first), load_points(second.out)
     assert np.array_equal(one.point_id, two.point_id) and np.allclose(one.xyz, two.xyz, atol=1e-9)
     assert np.array_equal(one.rgb, two.rgb)
 
@@ -359,8 +359,9 @@ def test_masks_follow_their_images(posed: Path, ingest: Ingest) -> None:
     assert min(image.xy[:, 0].min() for image in model.images.values()) >= 79
 
 
-def test_a_killed_run_goes_on_to_the_same_result(images: Path, ingest: Ingest, tmp_path: Path) -> None:
-    whole = ingest(images, "whole")
+def test_a_killed_run_goes_on_to_the_same_result(
+    images: Path, placed: Ingested, ingest: Ingest, tmp_path: Path
+) -> None:
     ingest(images, "resumed")
     # As if killed after matching and half of the publishing.
     work, out = tmp_path / "resumed.work", tmp_path / "resumed"
@@ -368,7 +369,7 @@ def test_a_killed_run_goes_on_to_the_same_result(images: Path, ingest: Ingest, t
         leftover.unlink()
     (work / "model").rename(work / "model.partial")
     (work / "images" / "000003.png").unlink()
-    assert same_bytes(whole.out, ingest(images, "resumed").out)
+    assert same_bytes(placed.out, ingest(images, "resumed").out)
 
 
 def test_few_registered_frames_fail_or_warn(images: Path, ingest: Ingest) -> None:
@@ -452,10 +453,9 @@ def test_a_wrong_focal_length_is_adjusted(posed: Path, ingest: Ingest, focal: fl
     assert errors_of_poses(done.out) < (0.3, 0.05)
 
 
-def test_the_lens_follows_from_the_images(images: Path, ingest: Ingest) -> None:
+def test_the_lens_follows_from_the_images(images: Path, placed: Ingested, ingest: Ingest) -> None:
     """A sum of radial terms that one term does not fit, and none."""
-    plain = ingest(images, "plain")
-    assert plain.result.summary["cameras"][0]["lens"] == "SIMPLE_RADIAL"
+    assert placed.result.summary["cameras"][0]["lens"] == "SIMPLE_RADIAL"
     lens = Intrinsics(
         "OPENCV", WIDTH, HEIGHT, (FOCAL, 1.04 * FOCAL, WIDTH / 2, HEIGHT / 2, -0.25, 0.3, 0.004, -0.003)
     )

@@ -18,8 +18,9 @@ import pytest
 from toy import Bench
 
 from cleargs.cli.main import COMMANDS, cli, explanation, invoke
+from cleargs.cli.outcome_lines import outcome_lines
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.cli.run import outcome_lines, without_effect
+from cleargs.cli.run import without_effect
 from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
@@ -219,6 +220,9 @@ def test_show(shell: Shell) -> None:
     code, out, _ = shell("show", folder)
     assert code == 0 and "complete" in out and "total 55" in out
     assert json.loads(shell("show", folder, "square", "--json")[1])["summary"] == {"total": 55}
+    code, out, _ = shell("show", folder, "time")
+    assert code == 0 and out.split()[:2] == ["part", "seconds"]
+    assert set(json.loads(shell("show", folder, "time", "--json")[1])) >= {"square"}
 
 
 def test_show_and_status_after_a_change(shell: Shell) -> None:
@@ -547,16 +551,6 @@ def test_the_doctor_tests_the_gpu(
         assert "driver: 550.54.15" in lines
         assert f"{'bad' if tested is FAILED else 'ok':<5} device" in "\n".join(lines)
         assert code == (1 if tested is FAILED else 0)
-
-
-def test_the_doctor_reports_the_pace(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for pace, words in ((None, "not measured yet"), (0.934, "takes 0.93 of the reference machine's time")):
-        monkeypatch.setattr("cleargs.cli.doctor.cached_pace", lambda pace=pace: pace)
-        invoke(["doctor", "--json"])
-        (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "pace")
-        assert found == {"what": "pace", "state": "ok", "text": words}
 
 
 def test_windows_is_refused_and_macos_is_not() -> None:

@@ -15,8 +15,8 @@ from toy import Bench
 
 from cleargs.cli.main import explanation, invoke
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.cli.show import _print_table
 from cleargs.cli.terminal import EscapingStream
+from cleargs.cli.terminal_table import print_table
 from cleargs.errors import InputError
 from cleargs.safe_io import printable
 
@@ -211,14 +211,14 @@ def test_show_wraps_labels_and_cuts_no_value(
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
     label = "median error of matches that the fit did not use, by origin of the poses, px"
-    _print_table([(label, "0.251 given, 0.183 adjusted"), ("focal length, px", "1234.567")], title="ingest")
+    print_table([(label, "0.251 given, 0.183 adjusted"), ("focal length, px", "1234.567")], title="ingest")
     out = capsys.readouterr().out
     assert "0.251 given," in out and "1234.567" in out and "…" not in out
     assert (
         " ".join(line[: out.splitlines()[1].index("0.251")].strip() for line in out.splitlines()[1:-1])
         == label
     )
-    _print_table(
+    print_table(
         [
             ["ingest", "complete", "1234.5", "12345.6", "frames 150, frames with a pose 149"],
             ["rva", "not done"],

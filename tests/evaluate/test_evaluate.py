@@ -37,11 +37,12 @@ from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.errors import InputError
 from cleargs.evaluate import refinement
+from cleargs.evaluate.alignment import align_cameras, umeyama
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_hash, write_report
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
-from cleargs.evaluate.references import Reference, align_cameras, reference_of, umeyama
+from cleargs.evaluate.references import Reference, reference_of
 from cleargs.media.exr import write_depth
 from cleargs.media.image import read_rgb, write_mask, write_rgb
 from cleargs.splat.gaussians import Gaussians

@@ -7,7 +7,7 @@ import pytest
 
 from cleargs.capture.cameras import Pose
 from cleargs.errors import InputError
-from cleargs.evaluate.references import _require_one_unit
+from cleargs.evaluate.alignment import require_one_unit
 
 
 def walk(factor: float, count: int = 8) -> list[Pose]:
@@ -22,8 +22,8 @@ POINTS = np.random.default_rng(0).uniform(-4, 4, (200, 3))
 
 def test_references_in_the_units_of_the_run_pass() -> None:
     for factor, count in ((1.0, 8), (2.0, 4), (0.2, 3)):
-        _require_one_unit(walk(factor, count), walk(1.0), POINTS)
-    _require_one_unit(walk(1.0, 1), walk(1.0), POINTS[:0])
+        require_one_unit(walk(factor, count), walk(1.0), POINTS)
+    require_one_unit(walk(1.0, 1), walk(1.0), POINTS[:0])
 
 
 @pytest.mark.parametrize(
@@ -31,5 +31,5 @@ def test_references_in_the_units_of_the_run_pass() -> None:
 )
 def test_metres_against_millimetres_are_an_error(factor: float, cause: str) -> None:
     with pytest.raises(InputError, match=cause) as error:
-        _require_one_unit(walk(factor), walk(1.0), POINTS)
+        require_one_unit(walk(factor), walk(1.0), POINTS)
     assert "millimetres" in str(error.value.hint)

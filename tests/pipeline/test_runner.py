@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -279,66 +278,24 @@ def test_full_disk_is_noticed_before_work(bench: Bench) -> None:
     assert bench.work_done() == [] and not bench.folder.exists()
 
 
-@dataclass
-class Machine:
-    """A machine that takes twice as long, which is known once it is measured."""
-
-    measured: int = 0
-
-    def pace(self, say: Callable[[str], None] | None) -> float:
-        if say is not None:
-            self.measured += 1
-        return 2.0 if self.measured else 1.0
-
-    def under(self, bench: Bench) -> Bench:
-        return replace(bench, dag=replace(bench.dag, pace=self.pace))
-
-
 def expected(bench: Bench) -> list[str]:
     return [line.partition(",")[0] for line in bench.remarks.lines if "estimate: " in line]
 
 
-def test_long_work_is_estimated_at_the_measured_pace(bench: Bench) -> None:
-    machine = Machine()
-    machine.under(bench).run("count.limit=3")
-    assert machine.measured == 1
+def test_estimates_follow_what_stages_took(bench: Bench) -> None:
+    bench.run("count.limit=3")
     first, after_count, after_square = expected(bench)
-    assert (first, after_count) == ("estimate: about 12.8 min", "new estimate: about 6.6 min")
-    assert after_square == "new estimate: about 18 s", "half of 36 s: the stages take no time here"
-    known = machine.under(bench).plan("square.power=3", "count.mode=padded")
-    costs = [plan.estimate.minutes for plan in known.values() if plan.estimate is not None]
-    assert costs == pytest.approx([0.2, 12.0, 0.6]), "planning uses the known pace"
+    assert (first, after_count) == ("estimate: about 6.4 min", "new estimate: about 3.3 min")
+    assert after_square == "new estimate: about 9 s", "half of 18 s: the stages take no time here"
 
 
 def test_stages_without_work_are_not_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """A draft printed "rivr: started", "new estimate: about 0 s ()" and "no repairs are made"."""
     monkeypatch.setattr(bench.dag.load("total"), "idle", lambda config: True, raising=False)
-    Machine().under(bench).run()
+    bench.run()
     assert (bench.folder / "total").exists()
     told = [line for line in bench.remarks.lines if "total" in line or "estimate" in line]
     assert [line.partition(":")[0] for line in told] == ["estimate", "new estimate"]
-
-
-def test_pace_is_not_measured_for_short_or_gpu_work(bench: Bench) -> None:
-    machine = Machine()
-    slow = machine.under(bench)
-    slow.run(until="count")
-    slow.plan()
-    slow.run()
-    assert machine.measured == 1 and slow.run() and machine.measured == 1
-    on_gpu = replace(bench.settings(["square.power=3"]), device="cuda")
-    with DigestMemo(bench.store / "digests.json") as memo:
-        planner = Planner(slow.dag, on_gpu, Store(on_gpu.store, memo), 1, bench.remarks)
-        assert planner.at_measured_pace(plans := planner.plan()) == plans
-    assert machine.measured == 1
-
-
-def test_the_pace_changes_no_key_and_no_result(bench: Bench) -> None:
-    before = [(outcome.manifest.key, outcome.manifest.digest) for outcome in bench.run()]
-    machine = Machine()
-    after = machine.under(bench).run(force=("count", "square", "total"))
-    assert machine.measured == 1 and {outcome.how for outcome in after} == {"made"}
-    assert [(outcome.manifest.key, outcome.manifest.digest) for outcome in after] == before
 
 
 def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_path: Path) -> None:

@@ -94,8 +94,6 @@ def test_a_short_training_gets_the_command_for_a_longer_one(
 def test_printed_commands_run_as_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # On a machine that is known to be fast, both commands are expected to take a minute.
-    monkeypatch.setattr("cleargs.splat.pace.cached_pace", lambda: None)
     monkeypatch.setattr(Planner, "pace_of", lambda self, made: 1.0)  # the fixture took no time
     finished = FinishedRun(tmp_path)
     (tmp_path / "my capture").mkdir()

@@ -25,7 +25,7 @@ from cleargs.report.single_file import write_single_file
 from cleargs.scene.views import camera_of
 from cleargs.splat.render import Viewer, render
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 DIFFERENCE = 12.0
 """Maximum mean absolute difference of the viewer's pixels from ours, in levels of 255. Measured: 9, mostly
@@ -45,7 +45,7 @@ class Report(Opened):
         self.settle()
 
     def box(self, selector: str) -> dict[str, float]:
-        """Where an element is in the window, after it was scrolled into its middle."""
+        """Position of an element in the window, after it was scrolled into its middle."""
         element = self.page.locator(selector)
         element.evaluate("(found) => found.scrollIntoView({behavior: 'instant', block: 'center'})")
         found = element.bounding_box()

@@ -25,6 +25,7 @@ PACKAGES = Path(__file__).parents[2] / ".oracles/node_modules"
 ENGINES = ("playcanvas/build/playcanvas.min.mjs", "@sparkjsdev/spark/dist/spark.module.js")
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.alone,
     pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
     pytest.mark.skipif(
         not all((PACKAGES / engine).is_file() for engine in ENGINES),

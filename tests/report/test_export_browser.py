@@ -21,7 +21,7 @@ from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.render import Viewer
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 SIZE = 320, 180
 FRAME = 3

@@ -30,7 +30,9 @@ from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
 from cleargs.report.advice import command
 from cleargs.report.frames import FrameRow, load_rows
-from cleargs.report.page import changed_settings, frame_data, json_in_html, write_report
+from cleargs.report.html import json_in_html
+from cleargs.report.page import write_report
+from cleargs.report.page_data import changed_settings, frame_data
 from cleargs.report.pictures import FramePictures, ImageFile, layers_of
 from cleargs.report.report_json import cameras_of, is_current, linked_manifests
 from cleargs.report.single_file import single_file_size, write_single_file

@@ -9,7 +9,7 @@ import pytest
 from helpers.chromium import CHROMIUM, NO_CHROMIUM, SIZES, Opened, check_page
 from made_pages import batch_page
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 
 @pytest.fixture(scope="module")

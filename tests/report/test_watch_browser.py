@@ -16,7 +16,7 @@ from cleargs.pipeline import live
 from cleargs.progress import PREVIEW
 from cleargs.splat.render import Viewer
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 
 def until(page: Any, condition: str) -> None:

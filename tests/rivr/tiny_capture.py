@@ -24,6 +24,7 @@ from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
+from cleargs.scene.config import G0Config
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.gaussians import Gaussians
@@ -32,7 +33,6 @@ from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import save_state
 from cleargs.splat.types import Moments
-from cleargs.stages.config import G0Config
 from cleargs.stages.consolidate import ConsolidateConfig
 from cleargs.stages.rivr import RivrConfig
 

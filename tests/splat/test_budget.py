@@ -10,10 +10,11 @@ from helpers.splat_toy import gaussians, images, start, views
 from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.stages import installed
+from cleargs.scene.config import G0Config
 from cleargs.splat.budget import gaussians_by_step, resolve_config, training_cost
 from cleargs.splat.config import Quality, TrainConfig, budget_from_pixels, steps_from_frames
 from cleargs.splat.trainer import Trainer
-from cleargs.stages.config import DistilConfig, G0Config
+from cleargs.stages.config import DistilConfig
 
 
 def test_steps_follow_the_frames_within_bounds() -> None:

@@ -26,12 +26,13 @@ from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import CountedTask, SilentReporter, Task
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
+from cleargs.scene.config import G0Config
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.ply import read_ply
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
 from cleargs.stages import cost, g0
-from cleargs.stages.config import DistilConfig, G0Config
+from cleargs.stages.config import DistilConfig
 
 ACTIVE = {0: 0.9, 1: 0.97, 2: 1.0, 5: 0.12}
 SUPPRESSED, HELD_OUT, UNREGISTERED = 3, 4, 6

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cleargs.scene.config import G0Config
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.schedule import INRIA_STEPS, Schedule, rate_factor
-from cleargs.stages.config import G0Config
 from cleargs.stages.consolidate import FinalDistilConfig
 from cleargs.stages.rivr import RivrConfig, RoundsConfig
 

@@ -22,7 +22,7 @@ from cleargs.splat.camera import Camera, Readout
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import warp_layout
 from cleargs.splat.kernels.cuda.support import gpu_fault
-from cleargs.splat.pace import random_scene
+from cleargs.splat.random_scene import random_scene
 from cleargs.splat.types import Moments
 
 
