@@ -20,8 +20,8 @@ MOST = 8_000
 
 SPACINGS, APART = 2.0, 0.02
 """Largest median distance of a triangulated point from the next loose one: in median distances of loose
-points from each other, or as a share of its distance from the nearest camera. Beyond both, they are of another
-place or in another world."""
+points from each other, or as a share of its distance from the nearest camera. Beyond both, they are not of
+this place or not in this world."""
 
 
 @dataclass(frozen=True)

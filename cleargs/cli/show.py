@@ -24,6 +24,7 @@ from cleargs.cli.common import (
     run_argument,
 )
 from cleargs.cli.frame_rows import frame_rows, reason, score_text, short_name
+from cleargs.cli.time_table import HEADS, time_rows
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.packed import WORKS, read_pack
@@ -80,6 +81,7 @@ Examples:
   cleargs show room                 all stages: state, time, size, figures
   cleargs show room rva             role and weight of each frame, and why
   cleargs show room rva --columns   the columns of the tables, with their meanings
+  cleargs show room time            where the time of each stage went
   cleargs show room scene           the box that holds the scene, for export --crop
   cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
@@ -129,6 +131,11 @@ def show(
             _print_run(settings, {name: done.get(name) for name in settings.stages(dag)})
     elif stage == "scene":
         _show_extent(dag, run, as_json)
+    elif stage == "time":
+        if as_json:
+            print_json({name: [one.model_dump() for one in done[name].timing] for name in done})
+        else:
+            _print_table(time_rows(done), *HEADS)
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     else:

@@ -38,18 +38,21 @@ REFERENCE_MS = 80.0
 """Time of an iteration on the reference machine: one core of an Intel Xeon (Emerald Rapids, AVX-512)."""
 
 TIMEOUT_S = 300
-"""Time limit of a measurement. It takes 2 s, or over 30 s if kernels must be compiled."""
+"""Time limit of a measurement. It takes a few seconds."""
 
 
 def machine_pace(say: Callable[[str], None] | None = None) -> float:
     """Return the pace of this machine, greater than 1 for slower machines; 1 if it is unknown.
 
     The pace is read from a cache, or measured if ``say`` is given; ``say`` then receives a message first.
+    It cannot be measured before the kernels are compiled (`cleargs.splat.compilation`).
     """
+    from cleargs.splat.kernels.cpu.jit import is_compiled  # loads Numba
+
     pace = cached_pace()
-    if pace is not None or say is None:
+    if pace is not None or say is None or not is_compiled("cpu"):
         return 1.0 if pace is None else pace
-    say("measuring the speed of this machine (once; longer if kernels must be compiled)")
+    say("measuring the speed of this machine, once")
     milliseconds = _measure_in_subprocess()
     if milliseconds is None:
         return 1.0

@@ -310,6 +310,15 @@ def test_long_work_is_estimated_at_the_measured_pace(bench: Bench) -> None:
     assert costs == pytest.approx([0.2, 12.0, 0.6]), "planning uses the known pace"
 
 
+def test_stages_without_work_are_not_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A draft printed "rivr: started", "new estimate: about 0 s ()" and "no repairs are made"."""
+    monkeypatch.setattr(bench.dag.load("total"), "idle", lambda config: True, raising=False)
+    Machine().under(bench).run()
+    assert (bench.folder / "total").exists()
+    told = [line for line in bench.remarks.lines if "total" in line or "estimate" in line]
+    assert [line.partition(":")[0] for line in told] == ["estimate", "new estimate"]
+
+
 def test_pace_is_not_measured_for_short_or_gpu_work(bench: Bench) -> None:
     machine = Machine()
     slow = machine.under(bench)

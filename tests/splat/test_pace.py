@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from cleargs.splat import pace
+from cleargs.splat.kernels.cpu.jit import compiled_mark
 from cleargs.splat.pace import REFERENCE_MS, cached_pace, machine_pace
 
 Results = list[float | None]
@@ -14,9 +15,10 @@ Results = list[float | None]
 
 @pytest.fixture
 def results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Results:
-    """Results of the next measurements; the cache is empty."""
+    """Results of the next measurements; the cache has compiled kernels only."""
     waiting: Results = []
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    compiled_mark("cpu").touch()
     monkeypatch.setattr(pace, "_measure_in_subprocess", lambda: waiting.pop(0))
     return waiting
 
