@@ -1,4 +1,4 @@
-"""Names of files and folders by which cameras, apps and programs mark what is no photograph of the scene."""
+"""Names by which cameras, apps and programs mark files that are not photographs of the scene."""
 
 from __future__ import annotations
 
