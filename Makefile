@@ -14,7 +14,7 @@
 # make convert-env       install .venv-convert, in which tools/convert_models converts PyTorch checkpoints
 # make test-convert      run the tests of these conversions
 # make browser           install what the browser tests of the report need in addition to Debian's chromium
-# make oracles           install .oracles, npm packages that read exported scenes in the tests
+# make oracles           install .oracles, programs of others that read exported scenes and captures in the tests
 # make cluster           install .venv-cluster, the Snakemake that runs a sheet on a cluster
 # TORCH_INDEX=URL gives pip an extra index of packages, for PyTorch's CPU build, which is much smaller.
 
@@ -109,14 +109,20 @@ browser: .venv/browser.stamp
 
 oracles: .oracles/stamp
 
+# Anew each time, because npm does not bring back files that were deleted below.
 .oracles/stamp: Makefile
+	rm -rf .oracles
 	npm install --prefix .oracles --ignore-scripts --silent \
 		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 @adobe/spz@0.2.3 @sparkjsdev/spark@2.2.0 three@0.180.0 fzstd@0.1.1
 	# Most of the files are maps, debug builds, examples and the GPU drivers of other machines.
 	cd .oracles/node_modules && find playcanvas/build/playcanvas?* ! -name playcanvas.min.mjs -delete && \
-		find three/examples -type f ! -name Pass.js -delete && rm -rf three/src @sparkjsdev/spark/dist/*.cjs.* && \
+		find three/examples -type f ! -name Pass.js ! -name OrbitControls.js -delete && rm -rf three/src @sparkjsdev/spark/dist/*.cjs.* && \
 		find . -name '*.map' -delete && find webgpu/dist \
 		-name '*.node' ! -name "$$(node -p 'process.platform')-$$(node -p 'process.arch').*" -delete
+	# nerfstudio's parser, and what its import needs in addition to our own packages.
+	$(PYTHON) -m pip install --disable-pip-version-check --quiet --no-deps --target .oracles/python \
+		nerfstudio==1.1.5 absl-py==2.5.1 docstring-parser==0.18.0 jaxtyping==0.3.11 msgspec==0.22.0 shtab==1.13.0 \
+		tensorboard==2.21.0 tyro==1.0.17 viser==1.1.1 wadler-lindig==0.1.8 websockets==17.4 zstandard==0.25.0
 	touch $@
 
 # A separate environment, because Snakemake needs other versions of numpy and pandas.

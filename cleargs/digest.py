@@ -23,6 +23,13 @@ MAX_ROWS = 500_000
 
 _Row: TypeAlias = tuple[int, int, int, int, str]
 
+MAX_FILES = 100_000
+"""Maximum number of files and folders below an input. A home folder or a whole disk, which a `run.toml` of
+another person may name, is not searched to its end."""
+
+RESULTS = ("run.toml", "cfg_args", "locks/store.lock")
+"""Files by which results of ClearGS (runs, stores) and of trainers that follow Inria's are known."""
+
 NOTHING: _Row = (-1, -1, -1, -1, "")
 """The row of a forgotten file. It matches no file, since sizes and times are not negative."""
 
@@ -47,10 +54,11 @@ def tree_digest(files: Mapping[str, str]) -> str:
 def files_under(path: Path, left_out: Callable[[Path], bool] = lambda folder: False) -> dict[str, Path]:
     """Return relative POSIX path -> file, for all files below the folder ``path`` that are not hidden.
 
-    Each folder is entered once, by its own name if it also has links: links may form loops. Folders for which
-    ``left_out`` is True are not entered.
+    Each folder is entered once, by its own name if it also has links: links may form loops. Folders with
+    results (`has_results`), and those for which ``left_out`` is True, are not entered. Raises InputError if
+    there are more than `MAX_FILES`.
     """
-    found, entered, folders, links = {}, set(), [path], list[Path]()
+    found, entered, folders, links, seen = {}, set(), [path], list[Path](), 0
     while folders or links:
         folder = folders.pop() if folders else links.pop()
         with suppress(OSError):  # a folder that may not be read has no files
@@ -59,15 +67,25 @@ def files_under(path: Path, left_out: Callable[[Path], bool] = lambda folder: Fa
                 continue
             entered.add((status.st_dev, status.st_ino))
             for place in sorted(folder.iterdir(), reverse=True):
+                if (seen := seen + 1) > MAX_FILES:
+                    raise InputError(
+                        f"{path} has more than {MAX_FILES:,} files, so it is not one capture",
+                        hint="give the folder of the images, or the video",
+                    )
                 if place.name.startswith("."):
                     continue
                 if place.is_dir():
-                    if left_out(place):
+                    if left_out(place) or has_results(place):
                         continue
                     (links if place.is_symlink() else folders).append(place)
                 else:
                     found[place.relative_to(path).as_posix()] = place
     return found
+
+
+def has_results(folder: Path) -> bool:
+    """Return True if ``folder`` is a run, a store, or the results of another trainer: never an input."""
+    return any((folder / name).is_file() for name in RESULTS)
 
 
 class DigestMemo:

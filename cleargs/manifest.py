@@ -19,6 +19,7 @@ from cleargs.errors import StoreError
 from cleargs.files import is_partial, write_json
 from cleargs.own_files import has_only_files, regular_files
 from cleargs.safe_io import FAULTS, read_json
+from cleargs.timing import PartTime
 
 MANIFEST = "manifest.json"
 
@@ -93,6 +94,8 @@ class Manifest(FrozenModel):
     """CPU time of all threads and child processes; None in manifests of earlier versions."""
     peak_memory_gb: float | None = None
     """Peak resident memory of the process while the stage ran, GB (1e9 bytes)."""
+    timing: tuple[PartTime, ...] = ()
+    """Times of the parts of the last attempt (`cleargs.timing`), each part before its own parts."""
     device: str
     summary: dict[str, Any]
     """The figures that the stage reports."""

@@ -59,17 +59,25 @@ class Rate:
     SECONDS = 10.0
     """Averaging window: one to two times this many seconds, less at the beginning."""
 
-    def __init__(self) -> None:
-        self._readings: list[tuple[float, int]] = []
+    def __init__(self, part: float = 0.0, least: float = 0.0) -> None:
+        """Make the window at least ``part`` of the time since the first call, and wait ``least`` seconds."""
+        self._part, self._least = part, least
+        self._readings: list[tuple[float, float]] = []
         """Up to two pairs of time and steps done: the start of the present window and of the next one."""
+        self._first: float | None = None
 
-    def per_second(self, done: int) -> float | None:
+    def per_second(self, done: float) -> float | None:
         """Return the rate; None at first. Call this each time ``done`` grows."""
         now = time.monotonic()
+        self._first = now if self._first is None else self._first
+        elapsed = now - self._first
         begin = self._readings[0] if self._readings else None
-        if begin is None or now - self._readings[-1][0] >= self.SECONDS:
+        window = max(self.SECONDS, self._part * elapsed)
+        if begin is None or now - self._readings[-1][0] >= window:
             self._readings = [*self._readings[-1:], (now, done)]
-        return (done - begin[1]) / (now - begin[0]) if begin is not None and now > begin[0] else None
+        if begin is None or now <= begin[0] or elapsed < self._least:
+            return None
+        return (done - begin[1]) / (now - begin[0])
 
 
 Show = Callable[[int, str, float | None], None]
@@ -79,12 +87,15 @@ Show = Callable[[int, str, float | None], None]
 class CountedTask:
     """A task that calls ``show`` after each change."""
 
+    LEAST = 1.0
+    """Seconds of work before the first estimate: steps that are reported together have no rate."""
+
     def __init__(self, total: int | None, show: Show) -> None:
         self.done, self.note = 0, ""
         self._total, self._show = total, show
-        self._first: tuple[float, float] | None = None
-        """Time after the first step, and the share of the work done by then. Work before that moment, such as
-        compiling kernels or reading a checkpoint, does not count for the estimate."""
+        self._rate = Rate(part=0.1, least=self.LEAST)
+        """Share of the work per second, from the first step on: work before it, such as compiling kernels or
+        reading a checkpoint, does not count."""
 
     def advance(self, steps: int = 1) -> None:
         self.update(done=self.done + steps)
@@ -98,10 +109,9 @@ class CountedTask:
         """Return the estimated remaining time of the task; None while it is unknown."""
         if not self._total or not self.done:
             return None
-        now = time.monotonic()
         share = self.done / self._total if share is None else share
-        begin, first = self._first = self._first or (now, share)
-        return (now - begin) * max(0.0, 1.0 - share) / (share - first) if share > first else None
+        speed = self._rate.per_second(share)
+        return max(0.0, 1.0 - share) / speed if speed else None
 
 
 class ForwardingTask(CountedTask):
@@ -139,6 +149,16 @@ class SilentReporter:
     def info(self, text: str) -> None: ...
 
     def warn(self, text: str) -> None: ...
+
+
+class WarningsOnly(SilentReporter):
+    """A reporter that passes on warnings alone."""
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter = reporter
+
+    def warn(self, text: str) -> None:
+        self._reporter.warn(text)
 
 
 @contextmanager

@@ -5,7 +5,18 @@ The runner loads ``cleargs.stages.<name>`` by name. Each module implements `clea
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 STAGES = ("ingest", "rva", "g0", "rivr", "consolidate")
+TRAININGS = frozenset({"g0", "rivr", "consolidate"})
+
+
+def prepare(names: Collection[str]) -> None:
+    """Start what the stages ``names`` will need on the CPU, next to those before them."""
+    if TRAININGS.intersection(names):
+        from cleargs.splat import compilation
+
+        compilation.begin()
 
 
 def gpu_fault(error: BaseException) -> str | None:

@@ -52,8 +52,8 @@ class IngestConfig(SfmConfig, CaptureConfig):
         return value
 
 
-FEW_FRAMES = 20
-"""Number of frames below which a warning is given."""
+FEW_FRAMES, GOOD_FRAMES = 20, 30
+"""Number of frames below which a warning is given, and the number that it asks for."""
 
 VERSION = 21
 CONFIG = IngestConfig
@@ -147,8 +147,11 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
             "highlights compressed; record in SDR where colours must be exact"
         )
-    if len(capture.frames) < FEW_FRAMES:
-        reporter.warn(f"there are only {len(capture.frames)} frames; a good scene needs 30 or more")
+    few = len(capture.frames) < FEW_FRAMES
+    if few and config.max_frames >= GOOD_FRAMES:  # a quick test, such as the demo, asks for fewer
+        reporter.warn(
+            f"there are only {len(capture.frames)} frames; a good scene needs {GOOD_FRAMES} or more"
+        )
     long_side = max(config.feature_size, config.max_size)
     capture = select_sharp_frames(capture, long_side, reporter, by_motion=config.fps is None)
     frames = prepare(capture, work, long_side, reporter)

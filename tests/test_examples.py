@@ -25,10 +25,13 @@ import cleargs as cg
 from cleargs.cli.main import invoke
 from cleargs.errors import CleargsError
 from cleargs.handover import gsplat_order
+from cleargs.media.image import write_mask
 from cleargs.progress import SilentReporter
 from cleargs.synth.synthetic_capture import make_capture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+NERFSTUDIO = EXAMPLES.parent / ".oracles/python"
+COLOURS = ("red", "green", "blue")
 
 TINY = """\
 [g0]
@@ -167,6 +170,46 @@ def test_other_trainers_hold_out_the_same_frames(place: Path, tmp_path: Path) ->
     names = sorted(image.name for image in model.images.values())
     assert {f"images/{name}" for name in names[:: facts["test_every"]]} == set(meta["test_filenames"])
     assert not facts["not_in_sparse"] and len(model.points3D) == len(capture.points.xyz)
+
+
+@pytest.mark.skipif(
+    not (NERFSTUDIO / "nerfstudio").is_dir(), reason="nerfstudio's parser is not installed (make oracles)"
+)
+def test_nerfstudios_own_parser_finds_the_same_capture(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The split, the cameras, the masks and the first points, as `ns-train splatfacto` gets them."""
+    monkeypatch.syspath_prepend(NERFSTUDIO)
+    shutil.copytree(place / "run", tmp_path / "run", symlinks=True)
+    capture = cg.open_prepared(tmp_path / "run" / "ingest")
+    write_mask(capture.folder / "dust.png", np.arange(96 * 54).reshape(54, 96) % 5 > 0)
+    frames = [
+        replace(
+            f, split="test" if f.frame_id in (1, 6) else "train", mask="dust.png" if not f.frame_id else ""
+        )
+        for f in capture.frames
+    ]
+    data = replace(capture, frames=frames).to_nerfstudio(tmp_path / "data")
+
+    def read(path: str) -> SimpleNamespace:  # in place of Open3D, which is large
+        vertex = PlyData.read(path)["vertex"]
+        points = np.column_stack([vertex[name] for name in "xyz"])
+        return SimpleNamespace(points=points, colors=np.column_stack([vertex[c] for c in COLOURS]) / 255)
+
+    monkeypatch.setitem(sys.modules, "open3d", SimpleNamespace(io=SimpleNamespace(read_point_cloud=read)))
+    module = importlib.import_module("nerfstudio.data.dataparsers.nerfstudio_dataparser")
+    parser = module.NerfstudioDataParserConfig(data=data, load_3D_points=True).setup()
+    for split, numbers in {"train": [0, 2, 3, 4, 5, 7], "val": [1, 6], "test": [1, 6]}.items():
+        found = parser.get_dataparser_outputs(split)
+        names = {path.name for path in found.image_filenames}
+        facts = json.loads((data / "split.json").read_text())["names"]
+        assert {facts[f"images/{name}"] for name in names} == {capture.frames[k].name for k in numbers}
+        assert all(path.is_file() for path in [*found.image_filenames, *found.mask_filenames])
+        assert len(found.cameras) == len(numbers) and float(found.cameras.fx[0]) == pytest.approx(
+            capture.cameras()[0].fx
+        )
+        assert len(found.metadata["points3D_xyz"]) == len(capture.points.xyz)
+        assert (found.metadata["points3D_rgb"].numpy() == capture.points.rgb).mean() > 0.9  # it rounds down
 
 
 def test_frames_repeat_by_their_weights_for_trainers_that_know_none(place: Path, tmp_path: Path) -> None:

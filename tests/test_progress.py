@@ -53,6 +53,33 @@ def test_the_remaining_time_is_never_negative(monkeypatch: pytest.MonkeyPatch) -
     assert shown == [None, 0.0]
 
 
+def seconds_left(monkeypatch: pytest.MonkeyPatch, steps: list[tuple[float, int]]) -> list[float | None]:
+    """Return the estimates of a task of 1,000 steps; ``steps`` are times and steps done by then."""
+    clock, shown = [0.0], list[float | None]()
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    task = CountedTask(1000, lambda done, note, left: shown.append(left))
+    for clock[0], done in steps:
+        task.update(done=done)
+    return shown
+
+
+def test_the_remaining_time_follows_the_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After other programs ended, "2.6 it/s, 806 s left" stood beside 430 steps that took 165 s."""
+    slow = [(float(t), t // 2) for t in range(2, 602, 2)]  # 300 steps at half a step per second
+    fast = [(600.0 + t, 300 + 3 * t) for t in range(1, 202)]
+    left = seconds_left(monkeypatch, slow + fast)
+    assert left[len(slow) - 1] == pytest.approx(1400, rel=0.01)
+    assert left[-1] == pytest.approx(97 / 3, rel=0.1)
+
+
+def test_steps_that_are_reported_together_have_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the pairs of images came at once: "370/738, 0 s left", and 40 s went by."""
+    burst = [(48.0 + k / 1e4, k) for k in range(1, 501)]
+    assert set(seconds_left(monkeypatch, burst)) == {None}
+    later = seconds_left(monkeypatch, [*burst, (96.0, 501)])[-1]
+    assert later == pytest.approx(48, rel=0.01)
+
+
 def test_screen_and_log_have_one_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once, the log took the steps and the screen the share of the work: 75 s and 863 s left."""
     clock = [0.0]
@@ -85,6 +112,7 @@ def test_a_task_without_steps_says_that_it_works(monkeypatch: pytest.MonkeyPatch
 
 def test_a_line_without_a_step_keeps_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "LINE_EVERY", 0.02)
+    monkeypatch.setattr(CountedTask, "LEAST", 0.0)
     lines: list[str] = []
     seen = Event()
 

@@ -18,7 +18,6 @@ from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import (
     frame_key,
-    image_files,
     is_wanted,
     mask_externals,
     masks_by_number,
@@ -42,7 +41,8 @@ _REDUCED = 0.75  # share of the long side up to which a folder with the names of
 
 _SYSTEM = re.compile(r"[.@#]|(__MACOSX|MeshroomCache|odm_\w+|.+\.(files|cmvs))$")
 """Names of hidden folders, of network disks' own, and of the work of Meshroom, ODM, Metashape, VisualSFM."""
-_RUNS = ("run.toml", "cfg_args")  # files in the results of ClearGS, and of the trainers that follow Inria's
+LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
+"""Files and folders with poses, by which a folder is a capture."""
 _MASK_FOLDER = re.compile(r"(.+[._-])?masks?", re.IGNORECASE)
 _PROCESSED = re.compile(
     r"correct|undist|rectif|edit|resiz|enhanc|upscal|denois|sharpen|deblur|render|export|"
@@ -52,6 +52,12 @@ _PROCESSED = re.compile(
 _PREVIEW_NAME = re.compile(r"thumb|thmbnl|preview|poster|contact.?sheet", re.IGNORECASE)
 _EDITED = re.compile(r"IMG_E(\d+)|(.+)[-_ ]edited|(.+) \(\d+\)", re.IGNORECASE)
 """Names of second versions: edited on iPhones, by Google Photos, and downloaded twice."""
+_BLURRED = (
+    (re.compile(r"(.+\.PORTRAIT-)\d+\.COVER"), r"\g<1>02.ORIGINAL"),
+    (re.compile(r"\d+l?PORTRAIT_\d+_(BURST\d+)_COVER"), r"00000PORTRAIT_00000_\1"),
+)
+"""Names of the portraits of a Pixel whose background it blurred, and those of the sharp ones next to them."""
+_BAND = re.compile(r"(.+)_(\d{1,2})")  # name of a picture of one spectral band (MicaSense)
 
 
 def _words(words: str, more: str = "$.") -> re.Pattern[str]:
@@ -61,6 +67,7 @@ def _words(words: str, more: str = "$.") -> re.Pattern[str]:
 
 _MAP = _words("normals?|semantics?|seg|segmentation|labels?|instances?|albedo|depths?|disparity|flow|masked")
 _INFRARED = _words("infra(red)?|n?ir|thermal", r"DJI_.+_T(HRM)?")
+_SPOT = _words("sky.?box\\d*", r"\d*_?pano(rama)?s?")
 _PRODUCT = _words("screen.?shot|texture|diffuse|map_kd|ortho(photo|mosaic)?|dsm|dem|pano(rama)?")
 _SMALL_VIDEO = _words("lrv|proxy|proxies|low.?res")
 
@@ -73,12 +80,22 @@ PREVIEWS, COPIES, OUTSIDE = (
     "second picture%s, reduced or in another format",
     "picture%s outside images/",
 )
+BROKEN = "file%s that cannot be opened"
+OTHERS = "picture%s of captures with poses in folders below"
+SPOT = "picture%s of panoramas from one spot"
+DEEP_TIFF = "TIFF picture%s of one channel, depth or a spectral band"
+SPECTRAL = "picture%s with other channels than red, green and blue"
+BANDS = "picture%s of other spectral bands"
 PRODUCTS = "picture%s named as a texture, map, panorama or screenshot"
 PHOTOGRAPHS, UNWANTED = "photograph%s", "file%s by --only or --skip"
 _HINTS = {
     VIDEOS: "photographs are taken; for the videos, give one as the input, or set --skip for the photographs",
     BELOW: "give their folder, or put all videos into one folder",
+    BROKEN: "they are broken links or devices: put the files themselves in their places",
     ALONE: "name masks like their photographs",
+    SPOT: "--only takes them; pictures that only turn show no depth",
+    SPECTRAL: "export red, green and blue as JPEG or PNG",
+    BANDS: "the first band is taken; --only takes another, such as '*_3.tif'",
     RAW: "convert them to JPEG or PNG",
     UNREADABLE: "pip install 'cleargs[heif]', or convert them to JPEG",
 }
@@ -117,9 +134,8 @@ class Contents:
         """Return photographs and masks by role (`Layout.externals`)."""
         folder = self.folder
         role = "capture" if folder == self.root else "images"
-        found: dict[str, External] = {role: folder, **mask_externals(self.root)}
-        if len(self.photographs) != len(image_files(folder)):
-            found[role] = {path.relative_to(folder).as_posix(): path for path in self.photographs}
+        names = {path.relative_to(folder).as_posix(): path for path in self.photographs}
+        found: dict[str, External] = {role: names, **mask_externals(self.root)}
         if self.masks:
             found["masks_beside"] = {m.relative_to(self.root).as_posix(): m for m in self.masks.values()}
         return found
@@ -166,6 +182,8 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
             hint="give names, folders or patterns as they are below the input: 'cam0', 'shots/*', '*.png'",
         )
     left_out: dict[str, Sequence[Path]] = {UNWANTED: sorted(set(found) - set(wanted))}
+    left_out[BROKEN] = [path for path in wanted if not path.is_file()]
+    wanted = _without(wanted, left_out[BROKEN])
     videos = [path for path in wanted if path.suffix.lower() in VIDEO_SUFFIXES]
     small, copies = _small_videos(videos, root), _second_videos(videos)
     videos = _without(videos, [*small, *copies])
@@ -183,11 +201,22 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
         # The place of the images in all layouts: what is elsewhere was put there on purpose.
         left_out[OUTSIDE] = [p for p in images if p not in inside and not _mask_folder(p, root)]
         images = _without(images, left_out[OUTSIDE])
+    left_out[OTHERS] = _of_other_captures(images, root, few=not videos)
+    images = _without(images, left_out[OTHERS])
     left_out[MASKS] = _masks(images, root)
     headers = {path: read_header(path) for path in _without(images, left_out[MASKS])}
-    left_out[INFRARED] = _infrared(headers, root)
-    shown = {path: header for path, header in headers.items() if path not in set(left_out[INFRARED])}
-    images, left_out[DEPTH], left_out[GREY] = _by_channels(shown)
+    left_out[SPECTRAL] = [path for path, header in headers.items() if header and header.spectral]
+    if left_out[SPECTRAL] and len(left_out[SPECTRAL]) == len(headers) and not videos:
+        raise InputError(f"{root} has only {SPECTRAL % 's'}", hint=_HINTS[SPECTRAL])
+    for kind, names in ((SPOT, _SPOT), (INFRARED, _INFRARED)):
+        headers = {path: header for path, header in headers.items() if path not in set(left_out[SPECTRAL])}
+        left_out[kind] = _by_name(names, headers, root)
+        headers = {path: header for path, header in headers.items() if path not in set(left_out[kind])}
+    images, deep, left_out[GREY] = _by_channels(headers)
+    left_out[DEEP_TIFF] = [path for path in deep if path.suffix.lower() in (".tif", ".tiff")]
+    left_out[DEPTH] = _without(deep, left_out[DEEP_TIFF])
+    left_out[BANDS] = _other_bands([path for path in images if _is_grey(headers[path])])
+    images = _without(images, left_out[BANDS])
     previews = _previews(images, headers, root, few=not videos)
     left_out[PREVIEWS] = [*previews, *small]
     images = _without(images, previews)
@@ -215,11 +244,8 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
 def media_files(root: Path) -> list[Path]:
     """Return pictures and videos below ``root``, without hidden ones and those of runs."""
     suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
-    found = files_under(
-        root,
-        lambda folder: bool(_SYSTEM.match(folder.name)) or any((folder / name).is_file() for name in _RUNS),
-    )
-    files = (path for path in found.values() if path.suffix.lower() in suffixes and path.is_file())
+    found = files_under(root, lambda folder: bool(_SYSTEM.match(folder.name)))
+    files = (path for path in found.values() if path.suffix.lower() in suffixes)
     return sorted(files, key=lambda path: (path.parent, path.name))
 
 
@@ -238,6 +264,17 @@ def _mask_folder(path: Path, root: Path) -> Path | None:
     depth = len(root.parts)
     found = (n for n, part in enumerate(path.parts[depth:-1], depth) if _MASK_FOLDER.fullmatch(part))
     return next((Path(*path.parts[: n + 1]) for n in found), None)
+
+
+def _of_other_captures(images: Sequence[Path], root: Path, *, few: bool) -> list[Path]:
+    """Return the pictures in folders below ``root`` that have poses, such as exports.
+
+    There are none if few pictures (and no videos) are elsewhere.
+    """
+    below = {folder for path in images for folder in path.parents if root in folder.parents}
+    own = {folder for folder in below if any((folder / name).exists() for name in LISTS)}
+    found = [path for path in images if not own.isdisjoint(path.parents)]
+    return found if len(images) - len(found) >= FEWEST or not few else []
 
 
 def _masks(images: Sequence[Path], root: Path) -> list[Path]:
@@ -264,9 +301,9 @@ def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
     return found
 
 
-def _infrared(headers: Mapping[Path, Header | None], root: Path) -> list[Path]:
-    """Return the pictures named as infrared, in any format. If there are few in colour, none is left out."""
-    found = [path for path in headers if any(map(_INFRARED.fullmatch, _parts(path, root)))]
+def _by_name(names: re.Pattern[str], headers: Mapping[Path, Header | None], root: Path) -> list[Path]:
+    """Return the pictures named so, in any format. If there are few others in colour, none is returned."""
+    found = [path for path in headers if any(map(names.fullmatch, _parts(path, root)))]
     colour = [path for path in _without(list(headers), found) if not _is_grey(headers[path])]
     return found if len(colour) >= FEWEST else []
 
@@ -286,6 +323,19 @@ def _by_channels(headers: Mapping[Path, Header | None]) -> tuple[list[Path], lis
     if len(colour) >= FEWEST or not (grey or deep):
         return colour, deep, grey
     return ([*colour, *grey], deep, []) if grey else ([*colour, *deep], [], [])
+
+
+def _other_bands(images: Sequence[Path]) -> list[Path]:
+    """Return the pictures of all bands but the first, if there are as many of each place (``IMG_0000_1``)."""
+    places: dict[Path, dict[str, Path]] = defaultdict(dict)
+    for path in images:
+        if found := _BAND.fullmatch(path.stem):
+            places[path.with_name(found[1])][found[2]] = path
+    bands = {tuple(sorted(files)) for files in places.values()}
+    if len(places) < FEWEST or len(bands) > 1 or sum(map(len, places.values())) < len(images):
+        return []
+    _, *others = bands.pop()
+    return [files[band] for files in places.values() for band in others]
 
 
 def _small_videos(videos: Sequence[Path], root: Path) -> list[Path]:
@@ -354,8 +404,8 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
 
 
 def _maps(images: Sequence[Path]) -> list[Path]:
-    """Return pictures named as normals, labels or depth that have the number of another picture."""
-    maps = [path for path in images if _MAP.fullmatch(path.stem)]
+    """Return pictures named, or in folders named, as normals, labels or depth, with the number of another."""
+    maps = [path for path in images if _MAP.fullmatch(path.stem) or _MAP.fullmatch(path.parent.name)]
     numbers = {_numbers(path) for path in _without(images, maps)} - {()}
     return [
         path for path in maps if any(_numbers(path)[: n + 1] in numbers for n in range(len(_numbers(path))))
@@ -368,6 +418,9 @@ def _numbers(path: Path) -> tuple[str, ...]:
 
 def _is_second(path: Path, stems: Mapping[Path, Path]) -> bool:
     """Return True if ``path`` is named as an edited version of one of ``stems``, or is a second download."""
+    for pattern, sharp in _BLURRED:
+        if (cover := pattern.fullmatch(path.stem)) and path.with_name(cover.expand(sharp)) in stems:
+            return True
     if (found := _EDITED.fullmatch(path.stem)) is None:
         return False
     first = stems.get(path.with_name(f"IMG_{found[1]}" if found[1] else found[2] or found[3]))

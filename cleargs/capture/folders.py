@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
+from cleargs.digest import files_under, has_results
 from cleargs.errors import InputError, listed
 from cleargs.media import IMAGE_SUFFIXES
 
@@ -34,18 +35,18 @@ def image_folders(root: Path) -> list[Path]:
 
 def image_files(folder: Path, *, below: bool = False) -> list[Path]:
     """Return the images in ``folder`` (``below``: in its subfolders too), unordered, without hidden ones."""
+    files = files_under(folder).values() if below else folder.iterdir()
     return [
         path
-        for path in (folder.rglob("*") if below else folder.iterdir())
-        if path.suffix.lower() in IMAGE_SUFFIXES
-        and path.is_file()
-        and is_inside(path.relative_to(folder).as_posix())
+        for path in files
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
     ]
 
 
 def folders_to_search(root: Path) -> list[Path]:
     """Return the folders with images: ``images/``, its reductions, others except ``masks/``, and ``root``."""
     others = sorted(path for path in root.iterdir() if path.is_dir() and is_inside(path.name))
+    others = [path for path in others if not has_results(path)]
     folders = dict.fromkeys([*image_folders(root), *others, root])
     folders.pop(root / "masks", None)
     return [folder for folder in folders if image_files(folder, below=folder != root)]

@@ -102,6 +102,8 @@ class Sfm(Features):
         self.used_database = self.database
         """The database with the features by which frames were placed."""
         self._torn_at: int | None = None
+        self._settled: tuple[pycolmap.Reconstruction, Path] | None = None
+        """Model and database of the last call of `_rejoined`, if another call would find the same."""
         self.output = job.folder / "model.partial"
         self._options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=job.seed)
         self._options.extract_colors = False
@@ -355,9 +357,13 @@ class Sfm(Features):
         other; the next ones then go on at another scale. The smaller side of such a join is placed again from
         the larger one.
         """
+        if self._settled is not None and self._settled[0] is model and self._settled[1] == database:
+            return model  # no frame was placed in between
         image, share = weakest_join(model, database)
+        self._settled = None
         for _ in range(_JOINS):
             if share >= _JOINED:
+                self._settled = model, database
                 break
             numbers = {found.image_id - 1 for found in model.images.values() if found.has_pose}
             before = {i for i in numbers if i < image - 1}
@@ -365,6 +371,7 @@ class Sfm(Features):
             found = self._continued(model, database, min(before, numbers - before, key=len), FIRST)
             again, better = weakest_join(found, database)
             if better <= share or not _names_in(found) >= _names_in(model):
+                self._settled = model, database
                 break
             model, image, share = found, again, better
         torn = share < _JOINED and scales_differ(all_tracks(database), model, image)

@@ -44,6 +44,9 @@ _LABELS = {
 EXPOSURES_DIFFER = 0.5
 """Gain of PSNR by aligned colours, dB, above which the gain is printed."""
 
+OPAQUE_DB = 45
+"""PSNR between a scene over two backgrounds, dB, above which the background is not visible."""
+
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
 
@@ -286,10 +289,12 @@ def _print(report: Report, output: Path | None) -> None:
         console.print(line)
     console.print(table)
     for evaluation in report.evaluations:
-        console.print(_regions(evaluation))
+        if lines := _regions(evaluation):
+            console.print("\n  ".join([f"{_subject(evaluation)}:", *lines]))
     console.print(_provenance(first))
-    for metric, reason in first.unavailable.items():
-        console.print(f"{metric}: {reason}")
+    for reason in dict.fromkeys(first.unavailable.values()):
+        missing = [metric for metric, why in first.unavailable.items() if why == reason]
+        console.print(f"{', '.join(missing)}: {reason}")
     if output is not None:
         console.print(f"written: {output}")
 
@@ -310,25 +315,27 @@ def _provenance(evaluation: Evaluation) -> str:
     return "; ".join(words)
 
 
-def _regions(evaluation: Evaluation) -> str:
-    """Return a line with the PSNR in regions in which scenes often fail, and in other comparisons."""
+def _regions(evaluation: Evaluation) -> list[str]:
+    """Return lines with the PSNR in regions in which scenes often fail, and in other comparisons."""
     parts = {"behind the sparse points": evaluation.far, "clipped in the references": evaluation.clipped}
-    words = [
-        f"{name} {part.share:.1%} of the pixels, {_figure('psnr', part.psnr)} dB"
+    lines = [
+        f"{name}: {_figure('psnr', part.psnr)} dB on {part.share:.1%} of the pixels"
         for name, part in parts.items()
-        if part is not None
+        if part is not None and part.psnr is not None
     ]
     if evaluation.psnr_white is not None:
+        lines.append(f"over white: {evaluation.psnr_white:.2f} dB")
+    if evaluation.psnr_between is not None:
         between = _figure("psnr", evaluation.psnr_between)
-        words.append(f"over white {evaluation.psnr_white:.2f} dB, {between} dB from black")
+        lines.append(f"its background against white: {between} dB; above {OPAQUE_DB} it does not show")
     plain, aligned = evaluation.means.get("psnr"), evaluation.psnr_colour_aligned
     if plain is not None and aligned is not None and aligned - plain > EXPOSURES_DIFFER:
-        words.append(f"exposures differ: {aligned:.2f} dB with aligned colours (--align-colour)")
+        lines.append(f"exposures differ: {aligned:.2f} dB with aligned colours (--align-colour)")
     if evaluation.psnr_as_filmed is not None:
-        words.append(f"{evaluation.psnr_as_filmed:.2f} dB as the camera took the frames")
+        lines.append(f"as the camera took the frames: {evaluation.psnr_as_filmed:.2f} dB")
     if evaluation.covered is not None:
-        words.append(f"{evaluation.covered:.1%} behind Gaussians in front of the true surface")
-    return f"{_subject(evaluation)}: {'; '.join(words)}"
+        lines.append(f"behind Gaussians in front of the true surface: {evaluation.covered:.1%} of the pixels")
+    return lines
 
 
 def _figure(metric: str, value: float | None) -> str:

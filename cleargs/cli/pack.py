@@ -10,7 +10,8 @@ from pathlib import Path
 
 import click
 
-from cleargs.cli.common import FILE, answer, json_option, run_argument
+from cleargs.cli.common import FILE, answer, json_option, quiet_option, run_argument
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
 from cleargs.named_views import VIEWS
@@ -42,8 +43,9 @@ Examples:
 @click.option("-o", "--output", type=FILE, help="The new file (.zip).  [default: RUN.zip]")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @json_option
+@quiet_option
 @click.pass_obj
-def pack(dag: Stages, run: Path, output: Path | None, force: bool, as_json: bool) -> None:
+def pack(dag: Stages, run: Path, output: Path | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Pack the files of RUN that its report and an export need into a ZIP file.
 
     These are the report, the last scene, the poses and the tables. The images, the earlier scenes and the
@@ -61,7 +63,11 @@ def pack(dag: Stages, run: Path, output: Path | None, force: bool, as_json: bool
     results = [name for name in files if name.partition("/")[0] in dag.names]
     packed = Pack(scene=stage, files=(f"{stage}/{SCENE}", *sorted(results)))
     files |= {SCENE: run / stage / SCENE, PACK: run / RUN_FILE}  # PACK has the date of the settings
-    with atomic_path(output) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+    with (
+        atomic_path(output) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
+        make_reporter(quiet).task(f"packing {name}", len(files)) as task,
+    ):
         for inside, file in sorted(files.items()):
             content = file.read_bytes()
             if inside == PACK:
@@ -74,6 +80,7 @@ def pack(dag: Stages, run: Path, output: Path | None, force: bool, as_json: bool
             entry = zipfile.ZipInfo.from_file(file, f"{name}/{inside}", strict_timestamps=False)
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
+            task.advance()
     size = output.stat().st_size
     answer(
         as_json,

@@ -22,6 +22,7 @@ from cleargs.cli.common import (
 from cleargs.cli.frame_rows import frame_rows, score_text, short_name
 from cleargs.cli.show_frame import show_frame
 from cleargs.cli.terminal_table import print_table
+from cleargs.cli.time_table import HEADS, time_rows
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.packed import WORKS, read_pack
@@ -73,6 +74,7 @@ Examples:
   cleargs show room                 all stages: state, time, size, figures
   cleargs show room rva             role and weight of each frame, and why
   cleargs show room rva --columns   the columns of the tables, with their meanings
+  cleargs show room time            where the time of each stage went
   cleargs show room scene           the box that holds the scene, for export --crop
   cleargs show room --frame 3       all facts about a frame, and its layers: room/frame-000003.png
 """
@@ -122,6 +124,11 @@ def show(
             _print_run(settings, {name: done.get(name) for name in settings.stages(dag)})
     elif stage == "scene":
         _show_extent(dag, run, as_json)
+    elif stage == "time":
+        if as_json:
+            print_json({name: [one.model_dump() for one in done[name].timing] for name in done})
+        else:
+            print_table(time_rows(done), *HEADS)
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     else:

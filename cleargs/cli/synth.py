@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import answer, completed, json_option, parse_size
+from cleargs.cli.common import answer, completed, json_option, parse_size, quiet_option
 from cleargs.cli.progress_bars import make_reporter
 
 
@@ -71,7 +71,8 @@ Protocols, with mean lengths at a width of 640 px:
     help="phone, zoom (1 to 1.8), switch (to 1.8x halfway), breathing (by 1.5 %), or fisheye (122 degrees).",
 )
 @json_option
-def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> None:
+@quiet_option
+def synth(out: Path, size: tuple[int, int], as_json: bool, quiet: bool, **options: Any) -> None:
     """Make a synthetic handheld capture of a procedural room in the new folder OUT.
 
     OUT/images and OUT/transforms.json are the capture. OUT/truth holds the ground truth: sharp views with
@@ -80,7 +81,7 @@ def synth(out: Path, size: tuple[int, int], as_json: bool, **options: Any) -> No
     """
     from cleargs.synth.synthetic_capture import make_capture
 
-    summary = make_capture(out, width=size[0], height=size[1], reporter=make_reporter(), **options)
+    summary = make_capture(out, width=size[0], height=size[1], reporter=make_reporter(quiet), **options)
     answer(as_json, summary, *capture_lines(out, summary))
 
 

@@ -13,6 +13,8 @@ from cleargs.safe_io import FAULTS, open_regular
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif", ".heics"})
 """File endings of images that need the package pillow-heif."""
 
+_TIFF_TAGS = (256, 257, 277)  # width, height, samples per pixel
+
 _GREY = ("1", "L", "LA", "La", "P", "PA")
 
 
@@ -25,6 +27,8 @@ class Header(NamedTuple):
     """True if the image has one channel, of 8 bits or fewer. Palettes count: masks and labels have them."""
     deep: bool
     """True if the image has one channel of more than 8 bits, as depth maps have."""
+    spectral: bool = False
+    """True if it is a TIFF file of several channels that Pillow cannot read, as of spectral bands."""
 
 
 def read_header(path: Path) -> Header | None:
@@ -41,6 +45,19 @@ def read_header(path: Path) -> Header | None:
             with Image.open(path) as image:
                 deep = image.mode.startswith(("I", "F"))
                 return Header(image.size, image.mode in _GREY, deep)
+    return _spectral_header(path) if path.suffix.lower() in (".tif", ".tiff") else None
+
+
+def _spectral_header(path: Path) -> Header | None:
+    """Return the header of a whole TIFF file that Pillow cannot read; None if it is damaged."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    with suppress(SyntaxError, *FAULTS), open_regular(path) as file:
+        directory = ImageFileDirectory_v2(file.read(8))
+        file.seek(directory.next)
+        directory.load(file)
+        width, height, samples = (int(directory[tag]) for tag in _TIFF_TAGS)
+        return Header((width, height), False, False, spectral=True) if samples > 1 else None
     return None
 
 

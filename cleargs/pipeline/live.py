@@ -20,6 +20,7 @@ from cleargs.own_files import nodes_below
 from cleargs.pipeline.store import writer_is_alive
 from cleargs.progress import COMPILING, PREVIEW, ForwardingTask, Reporter, Task
 from cleargs.safe_io import FAULTS, read_json
+from cleargs.timing import timed
 
 PROGRESS_FILE = ".at_work.json"
 
@@ -169,7 +170,7 @@ class RecordingReporter:
         show(0, "", None)
         if total is None:  # nothing may come until its end
             self.write()
-        with self._reporter.task(label, total) as task:
+        with timed(label), self._reporter.task(label, total) as task:
             yield ForwardingTask(task, total, show)
         if label == COMPILING:
             self.compile_seconds += time.monotonic() - begun

@@ -99,7 +99,8 @@ class Place:
     def __init__(self, path: Path, *, hard_links: bool = True) -> None:
         self._names = _names(path)
         self._around = {_identity(one) for way in self._names for one in (way, *way.parents)} - {None}
-        self._file = _identity(path) if hard_links and path.is_file() else None
+        shared = hard_links and path.is_file() and path.stat().st_nlink > 1
+        self._file = _identity(path) if shared else None
 
     def is_inside(self, place: Path) -> bool:
         """Return True if the path, which need not exist, is ``place``, is in it, or links to something in it.

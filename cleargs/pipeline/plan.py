@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -141,17 +141,23 @@ class Planner:
         places = self._externals(name)
         for folder in (self.run.folder, self.run.source, self.store.root):
             require_utf8(folder)
-        self._keep_apart(places.values())
+        self._keep_apart(places)
         return {role: self.store.memo.digests_of(place, rehash=rehash) for role, place in places.items()}
 
-    def _keep_apart(self, places: Iterable[External]) -> None:
-        """Raise InputError unless the run, its store and the ``places`` of its inputs are apart."""
+    def _keep_apart(self, places: Mapping[str, External]) -> None:
+        """Raise InputError unless the run, its store and the ``places`` of its inputs (by role) are apart.
+
+        The run may be next to what a folder holds (``images/``, videos), but not among its photographs.
+        """
         run, source, hint = self.run.folder, self.run.source, "choose a folder next to the input with -o"
         given = Place(source, hard_links=False)
         within = Place(run).is_inside(source)
         if within and given.is_inside(run):
             raise InputError(f"the run folder {run} is the input itself", hint=hint)
-        folders = [place for place in places if isinstance(place, Path)]
+        folders = [place for place in places.values() if isinstance(place, Path)]
+        listed = [(role, place) for role, place in places.items() if isinstance(place, Mapping)]
+        around = {(role, file.parent) for role, files in listed for file in files.values()}
+        folders += {folder for role, folder in around if role == "capture" or folder != source}
         for place in folders if within else (*folders, source):
             for what, folder, option in (("run folder", run, "-o"), ("store", self.store.root, "--store")):
                 if Place(folder).is_inside(place):

@@ -46,7 +46,9 @@ from cleargs.pipeline.plan import (
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, SCENE, RunSpec, known_metadata, write_run_file
 from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.pipeline.stages import Stages
-from cleargs.pipeline.store import Entry, Store, copied_key
+from cleargs.pipeline.store import Entry, Spent, Store, copied_key
+from cleargs.progress import WarningsOnly
+from cleargs.timing import cpu_seconds, recorded
 
 BUSY = 1.5
 """Time by the clock divided by processor time from which other programs are named as the cause."""
@@ -82,6 +84,8 @@ class Runner(Planner):
                 self.dag.load(plan.stage).preflight(self.run.config.effective[plan.stage])
         check_address_space(plans)
         check_disk(plans, self.store.root)
+        if self.run.device == "cpu":
+            self.dag.prepare([plan.stage for plan in plans if plan.state != "done"])
         for line in (*rerun_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)
@@ -151,7 +155,7 @@ class Runner(Planner):
         costs = [
             replace(plan, estimate=self.estimate(plan.stage, done).at_pace(pace))
             for plan in plans
-            if plan.estimate is not None
+            if plan.estimate is not None and self._has_work(plan.stage)
         ]
         if line := cost_line(costs):
             note = (
@@ -179,12 +183,17 @@ class Runner(Planner):
                 manifest = entry.complete if entry is not None and not forced else None
                 if manifest is None:  # otherwise another process made it in the meantime
                     because = "" if reasons == (NO_RESULTS,) else f" ({'; '.join(reasons)})"
-                    self.reporter.info(f"{name}: started{because}")
+                    if self._has_work(name):
+                        self.reporter.info(f"{name}: started{because}")
                     manifest, how = self._make(stage_key, entry, forced=forced, locked=locked), "made"
         manifest = self._with_inherited(manifest, stage_key.inherited)
         self.store.link(self.run.folder, name, stage_key.parts.key)
         self._link_scene()
         return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.parts.key))
+
+    def _has_work(self, name: str) -> bool:
+        """Return False for a stage that only hands on the results of others, as repairs in a draft."""
+        return name in self.run.stages(self.dag)
 
     def _rehashed_key(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
         """Return the key of ``name`` after reading all inputs again: a failing disk changes no time stamp.
@@ -213,19 +222,28 @@ class Runner(Planner):
         context = self.context(name, stage_key.inputs, work)
         drop_links(context.cache, in_place=context.cache)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
-        earlier = work.seconds
-        try:
-            with recorded_progress(self.reporter, self.run.folder, name, work.folder) as reporter:
+        shown = self.reporter if self._has_work(name) else WarningsOnly(self.reporter)
+        progress = recorded_progress(shown, self.run.folder, name, work.folder)
+        with recorded() as times, progress as reporter:
+
+            def spent() -> Spent:
+                compiling = reporter.compile_seconds
+                return work.spent.plus(
+                    Spent(time.monotonic() - clock - compiling, usage.cpu_seconds, compiling)
+                )
+
+            try:
                 result = self._run_stage(name, replace(context, reporter=reporter))
-        except BaseException:  # also when interrupted: the time counts when the stage resumes
-            work.note_seconds(earlier + time.monotonic() - clock)
-            raise
-        seconds = earlier + time.monotonic() - clock - reporter.compile_seconds
+            except BaseException:  # also when interrupted: the time counts when the stage resumes
+                work.note_spent(spent())
+                raise
+        took = spent()
         cost = {
-            "seconds": round(seconds, 3),
-            "compile_seconds": round(reporter.compile_seconds, 3),
-            "cpu_seconds": round(usage.cpu_seconds, 3),
+            "seconds": round(took.clock, 3),
+            "compile_seconds": round(took.compiling, 3),
+            "cpu_seconds": round(took.processor, 3),
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
+            "timing": times.rows(),
         }
         now = self.external_digests(name)
         if now != {role: stage_key.origins[role] for role in now}:
@@ -331,12 +349,12 @@ class Usage:
     def __init__(self) -> None:
         with suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")  # resets the peak (man 5 proc)
-        self._cpu_seconds, self._peak_of_children = _cpu_seconds(), _peak(resource.RUSAGE_CHILDREN)
+        self._cpu_seconds, self._peak_of_children = cpu_seconds(), _peak(resource.RUSAGE_CHILDREN)
 
     @property
     def cpu_seconds(self) -> float:
         """Processor time of all threads and of ended child processes, in seconds."""
-        return _cpu_seconds() - self._cpu_seconds
+        return cpu_seconds() - self._cpu_seconds
 
     @property
     def peak_memory_gb(self) -> float:
@@ -346,11 +364,6 @@ class Usage:
             if found := re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text()):
                 own = int(found[1]) * 1024
         return max(own, children if children > self._peak_of_children else 0) / 1e9
-
-
-def _cpu_seconds() -> float:
-    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(used.ru_utime + used.ru_stime for used in both)
 
 
 def _peak(who: int) -> int:

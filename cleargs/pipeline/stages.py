@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from importlib import import_module
 from typing import cast
@@ -18,6 +18,8 @@ class Stages:
     names: tuple[str, ...]
     load: Callable[[str], Stage]
     """Load a stage by name."""
+    prepare: Callable[[Collection[str]], None] = lambda names: None
+    """Start what the stages ``names`` will need on the CPU, next to those before them."""
     gpu_fault: Callable[[BaseException], str | None] = lambda error: None
     """Return one line about the GPU failure that caused an error; None if the GPU is not the cause."""
 
@@ -38,7 +40,7 @@ class Stages:
 def installed() -> Stages:
     """Return the stages of the package ``cleargs.stages``. A module is imported when it is first used."""
     package = import_module("cleargs.stages")
-    return Stages(tuple(package.STAGES), load_stage, package.gpu_fault)
+    return Stages(tuple(package.STAGES), load_stage, package.prepare, package.gpu_fault)
 
 
 def load_stage(name: str) -> Stage:

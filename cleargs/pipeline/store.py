@@ -28,7 +28,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError, StoreError, listed
@@ -58,7 +58,20 @@ _CACHED = re.compile(rf"{_KEY}(\.\w+)?")
 """Forms of the names of results, work folders, remains of deleted folders, and files of a cache."""
 
 SECONDS = "seconds"
-"""File in a work folder with the time that earlier attempts took, in seconds."""
+"""File in a work folder with what earlier attempts took (`Spent`)."""
+
+
+class Spent(NamedTuple):
+    """Seconds that work took."""
+
+    clock: float = 0.0
+    """By the clock, without compiling kernels."""
+    processor: float = 0.0
+    compiling: float = 0.0
+
+    def plus(self, other: Spent) -> Spent:
+        return Spent(*(mine + theirs for mine, theirs in zip(self, other, strict=True)))
+
 
 Kind = Literal["finished", "unfinished", "kept", "rubbish"]
 """Content of a folder that `Store.collect` may remove."""
@@ -101,17 +114,18 @@ class WorkFolder:
         return self.folder / "checkpoints"
 
     @property
-    def seconds(self) -> float:
-        """Time that earlier attempts at this work took, as far as it was noted; in seconds."""
+    def spent(self) -> Spent:
+        """What earlier attempts at this work took, as far as it was noted."""
         try:
-            return float((self.folder / SECONDS).read_text(encoding="ascii"))
-        except (OSError, ValueError):
-            return 0.0
+            return Spent(*map(float, (self.folder / SECONDS).read_text(encoding="ascii").split()))
+        except (OSError, ValueError, TypeError):
+            return Spent()
 
-    def note_seconds(self, seconds: float) -> None:
-        """Write the time that all attempts took so far. On a full disk, it is lost."""
+    def note_spent(self, spent: Spent) -> None:
+        """Write what all attempts took so far. On a full disk, it is lost."""
         with suppress(OSError):
-            (self.folder / SECONDS).write_text(f"{seconds:.3f}", encoding="ascii")
+            text = " ".join(f"{seconds:.3f}" for seconds in spent)
+            (self.folder / SECONDS).write_text(text, encoding="ascii")
 
 
 class Store:

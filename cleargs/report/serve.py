@@ -46,6 +46,8 @@ class Server(ThreadingHTTPServer):
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         hint = "choose another --port (0: any free port), or a --host of this machine"
         with faults_as(InputError, f"cannot serve at {host}:{port}", hint=hint, faults=(OSError,)):
+            if not host:  # it would be every address of this machine
+                raise OSError("the host has no name")
             super().__init__((host, port), partial(_Handler, dag, run, host))
 
     @property
@@ -108,9 +110,11 @@ class _Handler(SimpleHTTPRequestHandler):
         report = self._run.folder / FOLDER
         file = Path(super().translate_path(path)) / (PAGE if url_path == f"/{FOLDER}/" else "")
         with suppress(OSError, ValueError):  # a link, a zero byte, a long name, a file outside the report
-            if file.relative_to(report).parts:  # the folder itself is redirected to its page
+            if file.relative_to(report).parts:
                 os.close(open_own(file, self._run.folder))
-            return str(file)
+                return str(file)
+            if report.is_dir() and not report.is_symlink():  # it is redirected to its page
+                return str(file)
         return ""
 
     def list_directory(self, path: Any) -> None:

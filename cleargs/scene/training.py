@@ -15,6 +15,7 @@ from cleargs.splat.config import TrainConfig
 from cleargs.splat.scene import Scene
 from cleargs.splat.trainer import Trainer
 from cleargs.splat.views import TrainingView
+from cleargs.timing import timed
 
 
 def train_into(
@@ -36,7 +37,9 @@ def train_into(
     trainer = Trainer(scene, views, config, formation=formation, device=device, **options)
     trained = trainer.run(checkpoint=checkpoint, reporter=reporter, label=label, round=round)
     learned = formation.exposure or exposure
-    dusted = without_dust(trained, views, learned, formation.frames, formation.moving, device)
+    with timed("removing dust"):
+        dusted = without_dust(trained, views, learned, formation.frames, formation.moving, device)
     weights = {view.frame_id: view.weight for view in views if view.kind == "real"}
-    SceneFolder(folder).write(dusted.trained, learned, formation, weights)
+    with timed("writing the scene"):
+        SceneFolder(folder).write(dusted.trained, learned, formation, weights)
     return dusted

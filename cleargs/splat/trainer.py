@@ -11,7 +11,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,11 +20,11 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
-from cleargs import kernel_cache
 from cleargs.errors import InputError, StageError
 from cleargs.media.image import write_rgb
-from cleargs.progress import COMPILING, PREVIEW, Rate, Reporter, Task
+from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
+from cleargs.splat import compilation
 from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
 from cleargs.splat.budget import resolve_config, seconds_by_step
 from cleargs.splat.camera import Camera
@@ -35,7 +34,6 @@ from cleargs.splat.densifier import Densifier, DensifierState, load_densifier
 from cleargs.splat.formation import Formation, Formed, recorded
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.interruption import deferred_sigterm
-from cleargs.splat.kernels.cpu.jit import compiled_mark
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.rasteriser import view_numbers
 from cleargs.splat.scene import Colour, Scene
@@ -45,6 +43,7 @@ from cleargs.splat.texture import TextureLoss, crop_of
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, TrainingView, require_views
+from cleargs.timing import timed
 
 _NOTE_INTERVAL = 10  # steps between updates of the progress bar, and on a GPU between updates of the log
 
@@ -142,7 +141,7 @@ class Trainer:
         elif saved is not None:
             self.restore(saved)
             reporter.info(f"{label}: resuming from step {self.done} of {self.length}")
-        self._warm_up(reporter)
+        compilation.finish(self._device.type, self._backend.warm_up, reporter)
         with (
             support.memory_errors(),
             deferred_sigterm() as terminated,
@@ -163,8 +162,9 @@ class Trainer:
                 if due or self.done % _CHECK_INTERVAL == 0:
                     self.check_finite()
                 if due:
-                    save_state(checkpoint, self.state())
-                    write_rgb(checkpoint.with_name(PREVIEW), self.preview().cpu().numpy())
+                    with timed("checkpoint and preview"):
+                        save_state(checkpoint, self.state())
+                        write_rgb(checkpoint.with_name(PREVIEW), self.preview().cpu().numpy())
                     next_save = _next_save(now, time.monotonic())
                 if stopped:
                     raise KeyboardInterrupt
@@ -172,17 +172,6 @@ class Trainer:
             self._show(task, fractions, rate)
         state = {k: tensor.cpu() for k, tensor in self.state().items() if not k.startswith("parameter.")}
         return Trained(self.scene.to("cpu"), self.rows(round), state)
-
-    def _warm_up(self, reporter: Reporter) -> None:
-        """Compile the kernels before the first step, as a separate task if that takes long."""
-        compiled = compiled_mark(f"{self._device.type}-{kernel_cache.installation()}")
-        if compiled.exists():
-            self._backend.warm_up()
-            return
-        with reporter.task(COMPILING):
-            self._backend.warm_up()
-        with suppress(OSError):
-            compiled.touch()
 
     @property
     def scene(self) -> Scene:
@@ -204,20 +193,23 @@ class Trainer:
         """Run one iteration: one view, one step of Adam and densification if it is due."""
         config, view, schedule_step = self._config, self._view(self.done), self._schedule_step
         factor = self._schedule.image_factor(schedule_step)
-        target, mask = self._cache.get(view, factor)
+        with timed("reading images"):
+            target, mask = self._cache.get(view, factor)
         alpha = self._cache.alpha
         colour = random_grey(self._seed, schedule_step) if config.background is None else None
         formed, looks = None, _Looks(partial(self._render, depth=True), colour, self._scene.background)
         if self._formation is not None:
             progress = schedule_step / config.planned
             opaque = mask if alpha is None else _both(mask, alpha > 0.5)
-            formed = self._formation.form(view, factor, progress, target, opaque, looks.render)
+            with timed("search for the formation"):
+                formed = self._formation.form(view, factor, progress, target, opaque, looks.render)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
         depth = formed is not None and formed.needs_depth
         render = looks.last_of(camera) or self._render(camera, depth=depth, background=colour)
-        image = render.image if formed is None else formed.forward(render)
+        with timed("image formation"):
+            image = render.image if formed is None else formed.forward(render)
         if alpha is None:
             mask = mask if formed is None else formed.mask
         else:
@@ -226,32 +218,40 @@ class Trainer:
             mask = mask if formed is None else _with_empty(formed.mask, mask, alpha)
         image, too_bright = recorded(image, target)
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
-        gradient = self._add_loss(image, target, mask, weight)
+        with timed("loss"):
+            gradient = self._add_loss(image, target, mask, weight)
         if self._texture is not None and self._schedule.sees_texture(schedule_step):
             crop = crop_of(self._seed, schedule_step, *target.shape[:2])
             share = config.texture * weight * image[crop].numel() / image.numel()
             hidden = None if mask is None else mask[crop]
-            gradient[crop] += share * self._texture.gradient(image[crop], target[crop], hidden)
+            with timed("texture"):
+                gradient[crop] += share * self._texture.gradient(image[crop], target[crop], hidden)
         gradient.masked_fill_(too_bright, 0.0)
         if self._densifier is not None and self._densifier.wants_errors(schedule_step):
-            errors = self._error_per_gaussian(image, target, mask, weight, formed)
+            with timed("errors of the Gaussians"):
+                errors = self._error_per_gaussian(image, target, mask, weight, formed)
             self._errors = errors if self._errors is None else self._errors + errors
-        gradients = self._rasteriser.backward(gradient if formed is None else formed.backward(gradient))
-        self._backend.regularise(
-            self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
-        )
-        step_gaussians(
-            self._gaussians,
-            gradients,
-            self._moments,
-            self._schedule.rates(schedule_step),
-            step=self._earlier_steps + self.done + 1,
-        )
+        with timed("image formation"):
+            gradient = gradient if formed is None else formed.backward(gradient)
+        with timed("backward pass"):
+            gradients = self._rasteriser.backward(gradient)
+        with timed("optimiser"):
+            self._backend.regularise(
+                self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
+            )
+            step_gaussians(
+                self._gaussians,
+                gradients,
+                self._moments,
+                self._schedule.rates(schedule_step),
+                step=self._earlier_steps + self.done + 1,
+            )
         if formed is not None:  # last, because it may wait for the device
             formed.learn()
         self.done += 1
         if self._densifier is not None:
-            self._densify(self._densifier)
+            with timed("densification"):
+                self._densify(self._densifier)
 
     def preview(self) -> Tensor:
         """Return a small render [H, W, 3] sRGB of the view with the largest weight. The next replaces it."""
@@ -334,7 +334,8 @@ class Trainer:
     def _render(self, camera: Camera, *, depth: bool, background: Colour | None = None) -> Render:
         """Render the scene over ``background`` (None: its own)."""
         scene = self.scene if background is None else replace(self.scene, background=background)
-        return self._rasteriser.view(scene, camera, depth=depth, sh_degree=self._sh_degree())
+        with timed("rendering"):
+            return self._rasteriser.view(scene, camera, depth=depth, sh_degree=self._sh_degree())
 
     def _sh_degree(self) -> int:
         return self._schedule.sh_degree(self._schedule_step, self._gaussians.sh_degree)

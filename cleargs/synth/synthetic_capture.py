@@ -148,7 +148,9 @@ def make_capture(
     novel = np.stack([setup.course.novel((number + 0.5) / count, rng) for number in range(count)])
     stems, novel_stems = ([f"{number:06d}" for number in range(views)] for views in (frames, count))
     (out / "images").mkdir(parents=True, exist_ok=True)
-    with reporter.task(f"synth {protocol}", (1 + STRIDE if video else 2) * frames + count) as task:
+    steps = (1 + STRIDE if video else 2) * frames + count
+    with reporter.task(f"making the capture {protocol}", steps) as task:
+        task.update(note="compiling first, once on this machine")
         motions, depths, nearnesses, luminances = [], [], [], []
         for folder in ("observed/images", "observed/depth", "novel/images", "novel/depth"):
             (out / "truth" / folder).mkdir(parents=True)
@@ -161,7 +163,7 @@ def make_capture(
             seen = depth[depth > 0]
             depths.append(float(seen.mean()))
             nearnesses.append(float((1 / seen).mean()))
-            task.advance()
+            task.update(done=len(depths), note="")
         faults = plan_faults(rules, motions, luminances, rate, seed)
         images = [f"images/{stem}.{'png' if rules.jpeg is None else 'jpg'}" for stem in stems]
         shots, rows = [], []

@@ -15,6 +15,7 @@ from typing import TypeAlias
 import av
 import cv2
 import numpy as np
+import OpenImageIO
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -362,3 +363,103 @@ def live_photographs(root: Path, pictures: Pictures, poses: Poses) -> None:
     for index, picture in enumerate(pictures):
         save(root / f"IMG_{index:04d}.JPG", picture)
         (root / f"IMG_{index:04d}.MOV").touch()
+
+
+def nerfcapture_offline(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """NeRFCapture's offline mode: names without endings, and the entries of its Manifest.swift."""
+    nerfcapture(root, pictures, poses)
+    camera = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
+    frames = []
+    for index, pose in enumerate(poses):
+        names = {"file_path": f"images/{index}", "depth_path": f"images/{index}.depth.png"}
+        frames.append({**names, "transform_matrix": (pose @ OPENGL).tolist(), "timestamp": 0.1, **camera})
+    (root / "transforms.json").write_text(json.dumps({**camera, "depth_integer_scale": 1, "frames": frames}))
+
+
+def contact_sheet(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs with a contact sheet, larger than each."""
+    for index, picture in enumerate(pictures):
+        save(root / f"IMG_{index:04d}.jpg", picture)
+    save(root / "Contact Sheet.jpg", np.vstack([np.hstack(pictures[:3]), np.hstack(pictures[3:6])]))
+
+
+def gopro(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A GoPro's card: two chapters of a video, each with a small copy and a preview."""
+    for chapter in (1, 2):
+        clip(root / f"DCIM/100GOPRO/GX0{chapter}0123.MP4", pictures)
+        small = root / f"DCIM/100GOPRO/GL0{chapter}0123.LRV"
+        small.write_bytes((root / f"DCIM/100GOPRO/GX0{chapter}0123.MP4").read_bytes())
+        (small.with_name(f"GX0{chapter}0123.THM")).write_bytes(b"\xff\xd8\xff")
+
+
+def dji(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A DJI's card: a video with its small copy and its subtitles, and the folder of previews."""
+    clip(root / "DCIM/DJI_001/DJI_20240101120000_0001_D.MP4", pictures)
+    (root / "DCIM/DJI_001/DJI_20240101120000_0001_D.LRF").write_bytes(b"small")
+    (root / "DCIM/DJI_001/DJI_20240101120000_0001_D.SRT").write_text("1")
+    (root / "MISC/THM/100").mkdir(parents=True)
+    (root / "MISC/THM/100/DJI_0001.THM").write_bytes(b"\xff\xd8\xff")
+
+
+def dji_panorama(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """A drone's photographs, and a panorama that it took from one spot, with equal names."""
+    for index, picture in enumerate(pictures):
+        save(root / f"DCIM/100MEDIA/DJI_{index + 1:04d}.JPG", picture)
+        save(root / f"DCIM/PANORAMA/100_0001/DJI_{index + 1:04d}.JPG", picture[:200, ::-1])
+
+
+def dji_multispectral(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Mavic 3 Multispectral: each photograph also in four bands of 16 bits."""
+    for index, picture in enumerate(pictures):
+        save(root / f"DJI_20240101_{index:04d}_D.JPG", picture)
+        for band in ("G", "R", "RE", "NIR"):
+            save(root / f"DJI_20240101_{index:04d}_MS_{band}.TIF", picture[..., 0].astype(np.uint16) * 99)
+
+
+def micasense(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """MicaSense RedEdge: five bands of 16 bits, no picture in colour."""
+    for index, picture in enumerate(pictures):
+        for band in range(1, 6):
+            values = picture[..., band % 3].astype(np.uint16) * 200
+            save(root / f"0000SET/000/IMG_{index:04d}_{band}.tif", values)
+
+
+def many_bands(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs, and TIFF files with five bands each."""
+    for index, picture in enumerate(pictures):
+        save(root / f"rgb/{index:04d}.jpg", picture)
+        (root / "bands").mkdir(exist_ok=True)
+        write_many_bands(root / f"bands/{index:04d}.tif")
+
+
+def write_many_bands(path: Path) -> None:
+    values = np.zeros((48, 64, 5), np.uint16)
+    image = OpenImageIO.ImageOutput.create(str(path))
+    image.open(str(path), OpenImageIO.ImageSpec(64, 48, 5, "uint16"))
+    image.write_image(values)
+    image.close()
+
+
+def matterport(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Matterport3D: pictures of its cameras, the six sides of each panorama, and depth."""
+    for index, picture in enumerate(pictures):
+        name = f"0e6e6b0332d745178dd37fc1d4a710a{index // 5}"
+        save(root / f"undistorted_color_images/{name}_i{index % 3}_{index % 5}.jpg", picture)
+        depth(root / f"undistorted_depth_images/{name}_d{index % 3}_{index % 5}.png")
+        save(root / f"undistorted_normal_images/{name}_d{index % 3}_{index % 5}_nx.png", picture[::-1])
+    for side in range(6):
+        save(root / f"matterport_skybox_images/{name}_skybox{side}_sami.jpg", pictures[side][:240, :240])
+
+
+def pixel_portraits(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Portraits of two versions of a Pixel's camera: sharp, and with a blurred background."""
+    for index, picture in enumerate(pictures):
+        blurred = cv2.GaussianBlur(picture, None, 9)
+        if index % 2:
+            name = f"PXL_20240101_1200{index:02d}000.PORTRAIT"
+            save(root / f"{name}-01.COVER.jpg", blurred)
+            save(root / f"{name}-02.ORIGINAL.jpg", picture)
+        else:
+            burst = f"BURST202001011200{index:02d}000"
+            save(root / f"IMG_{index}/00000PORTRAIT_00000_{burst}.jpg", picture)
+            save(root / f"IMG_{index}/00100lPORTRAIT_00100_{burst}_COVER.jpg", blurred)

@@ -15,6 +15,7 @@ from PIL import Image
 from cleargs.capture.choice import select_sharp_frames
 from cleargs.capture.prepare import read_stencil
 from cleargs.capture.sources import externals, open_capture, whole_capture
+from cleargs.cli.main import invoke
 from cleargs.errors import InputError
 from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
@@ -72,6 +73,24 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "Insta360": (apps.insta360, 10, "1 video (VID_20240101_120000_00_001.mp4); left out: 1 preview (LRV"),
     "edited video": (apps.edited_video, 10, "1 video in folders below (old/film.mp4), 1 preview (Proxies/"),
     "live": (apps.live_photographs, 10, "10 photographs; left out: 10 videos"),
+    "NeRFCapture offline": (
+        apps.nerfcapture_offline,
+        10,
+        "10 pictures that transforms.json lists; left out: 10",
+    ),
+    "contact sheet": (apps.contact_sheet, 10, "10 photographs; left out: 1 preview (Contact Sheet.jpg)"),
+    "GoPro": (apps.gopro, 20, "2 videos (DCIM/100GOPRO/GX010123.MP4, DCIM/100GOPRO/GX020123.MP4)"),
+    "DJI": (apps.dji, 10, "1 video (DCIM/DJI_001/DJI_20240101120000_0001_D.MP4)"),
+    "DJI panorama": (
+        apps.dji_panorama,
+        10,
+        "left out: 10 pictures of panoramas from one spot (DCIM/PANORAMA",
+    ),
+    "multispectral": (apps.dji_multispectral, 10, "10 infrared pictures, 30 TIFF pictures of one channel"),
+    "MicaSense": (apps.micasense, 10, "left out: 40 pictures of other spectral bands (0000SET/000/)"),
+    "many bands": (apps.many_bands, 10, "left out: 10 pictures with other channels than red, green and blue"),
+    "Matterport": (apps.matterport, 10, "6 pictures of panoramas from one spot (matterport_skybox_images/)"),
+    "Pixel": (apps.pixel_portraits, 10, "left out: 10 second pictures"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
@@ -84,7 +103,7 @@ def test_photographs_are_read_and_the_rest_is_told(tmp_path: Path, frames: Frame
         capture = open_capture(root, IngestConfig(poses=poses))
         assert len(capture.frames) == capture.n_available == count
         assert poses == "sfm" or told in capture.told
-        depths = ("depth", "conf", "thumb", "mask", "cover", "web", "infra", "ir/")
+        depths = ("depth", "conf", "thumb", "mask", "cover", "web", "infra", "ir/", "pano", "sky")
         assert not any(word in frame.name for frame in capture.frames for word in depths)
         named = externals(root, IngestConfig(poses=poses)).values()
         files = {p for place in named for p in (place.values() if isinstance(place, dict) else [place])}
@@ -215,6 +234,60 @@ def test_a_run_in_the_folder_is_no_photograph(images: Path, frames: Frames) -> N
     assert len(open_capture(images, IngestConfig()).frames) == 20
     (images / "room" / "run.toml").touch()
     assert len(open_capture(images, IngestConfig()).frames) == 10
+
+
+def result(folder: Path, kind: str, pictures: apps.Pictures) -> None:
+    """Write a run, a store or an exported capture with ``pictures`` into ``folder``."""
+    for index, picture in enumerate(pictures):
+        apps.save(folder / f"ingest/images/{index}.png", picture)
+    marks = {"run": "run.toml", "store": "locks/store.lock", "export": "ingest/sparse/0/images.bin"}
+    (folder / marks[kind]).parent.mkdir(parents=True, exist_ok=True)
+    (folder / marks[kind]).touch()
+
+
+@pytest.mark.parametrize("app", ["DCIM", "masks", "TUM", "Insta360", "Sony", "edited video", "RealSense"])
+@pytest.mark.parametrize("kind", ["run", "store", "export"])
+def test_results_in_a_capture_change_nothing(tmp_path: Path, frames: Frames, app: str, kind: str) -> None:
+    root, config = write(READ[app][0], tmp_path / "capture", frames), IngestConfig()
+    told, digested = open_capture(root, config).told, externals(root, config)
+    result(root / "out", kind, [255 - image for _, image in frames])
+    again = open_capture(root, config)
+    assert not any("out/" in str(frame.path) for frame in again.frames)
+    assert externals(root, config) == digested and (kind == "export" or again.told == told)
+
+
+@pytest.mark.parametrize("kind", ["run", "store"])
+def test_results_next_to_a_model_change_nothing(posed: Path, frames: Frames, kind: str) -> None:
+    (posed / "sparse").mkdir()
+    (posed / "transforms.json").unlink()
+    (posed / "sparse/images.bin").write_bytes(bytes(8))
+    before = externals(posed, IngestConfig())
+    result(posed / "out", kind, [image for _, image in frames])
+    assert externals(posed, IngestConfig()) == before
+
+
+@pytest.mark.parametrize(
+    ("app", "place", "refused"),
+    [
+        ("previews", "out", False),
+        ("previews", "shots/out", True),
+        ("masks", "out", True),
+        ("TUM", "out", False),
+        ("TUM", "rgb/out", True),
+        ("DCIM", "out", False),
+        ("DCIM", "DCIM/100APPLE/out", True),
+        ("Insta360", "VID", False),
+        ("Sony", "out", False),
+    ],
+)
+def test_a_run_may_be_next_to_photographs_but_not_among_them(
+    tmp_path: Path, frames: Frames, capsys: pytest.CaptureFixture[str], app: str, place: str, refused: bool
+) -> None:
+    root = write(READ[app][0], tmp_path / "capture", frames)
+    code = invoke(["run", str(root), "-o", str(root / place), "--dry-run", "--until", "ingest"])
+    said = capsys.readouterr().err
+    assert (code, "inside the input" in said) == ((2, True) if refused else (0, False)), said
+    assert not (root / place).exists()
 
 
 @pytest.mark.parametrize(
@@ -354,6 +427,32 @@ def test_listed_pictures_are_told(made: Ingested, frames: Frames, tmp_path: Path
     shutil.rmtree(root / "sparse")
     np.save(root / "poses_bounds.npy", poses_bounds([pose for pose, _ in frames]))
     assert open_capture(root, config).told.startswith(f"{read} poses_bounds.npy; left")
+
+
+def test_the_sharp_portraits_and_the_first_band_are_taken(tmp_path: Path, frames: Frames) -> None:
+    portraits = open_capture(write(apps.pixel_portraits, tmp_path / "phone", frames), IngestConfig())
+    assert not any("COVER" in frame.name for frame in portraits.frames)
+    bands = open_capture(write(apps.micasense, tmp_path / "drone", frames), IngestConfig())
+    assert all(frame.name.endswith("_1.tif") for frame in bands.frames)
+    assert any("--only takes another" in note for note in bands.notes)
+    third = open_capture(tmp_path / "drone", IngestConfig(only="*_3.tif"))
+    assert len(third.frames) == 10 and all(frame.name.endswith("_3.tif") for frame in third.frames)
+
+
+def test_panoramas_alone_are_taken(tmp_path: Path, frames: Frames) -> None:
+    root = write(apps.dji_panorama, tmp_path / "drone", frames)
+    shutil.rmtree(root / "DCIM/100MEDIA")
+    assert len(open_capture(root, IngestConfig()).frames) == 10
+    root = write(apps.matterport, tmp_path / "matterport", frames)
+    assert len(open_capture(root, IngestConfig(only="*skybox*")).frames) == 6
+
+
+def test_pictures_of_many_bands_alone_are_refused_by_name(tmp_path: Path) -> None:
+    for index in range(4):
+        apps.write_many_bands(tmp_path / f"{index}.tif")
+    with pytest.raises(InputError, match="other channels than red, green and blue") as refused:
+        open_capture(tmp_path, IngestConfig())
+    assert "as JPEG or PNG" in str(refused.value.hint)
 
 
 def test_raw_photographs_are_told(images: Path) -> None:

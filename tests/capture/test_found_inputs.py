@@ -258,13 +258,14 @@ def split(posed: Path) -> Path:
 
 
 def test_blenders_split_is_held_out(split: Path, ingest: Ingest) -> None:
-    done = ingest(split)
+    done = ingest(split, max_frames=24)
     parts = {frame.name: frame.split for frame in load_frames(done.out)}
     assert parts == {f"train/r_{i}.png": "train" for i in range(7)} | {
         f"test/r_{i}.png": "test" for i in range(8, 10)
     }
     assert done.result.summary["test"] == 2
     assert any("transforms_val.json" in text for text in done.warnings)
+    assert not any("only" in text for text in done.warnings), "a run of at most 24 frames cannot have 30"
     named = externals(split, IngestConfig())
     assert {split / "transforms_train.json", split / "transforms_test.json"} <= {
         path for path in named.values() if isinstance(path, Path)
@@ -430,4 +431,5 @@ def test_poses_bounds_are_read_where_the_model_names_other_images(project: Path,
     done = ingest(project)
     assert done.result.summary["kind"] == "llff" and done.result.summary["registered"] == 10
     assert any("10 of 10 images" in text and "poses_bounds.npy is read" in text for text in done.warnings)
+    assert any("only 10 frames" in text for text in done.warnings)
     assert externals(project, IngestConfig())["poses_bounds"] == project / "poses_bounds.npy"

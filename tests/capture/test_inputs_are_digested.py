@@ -78,15 +78,25 @@ def test_a_colmap_model_lists_no_image_outside_its_folder(posed: Path, ingest: I
         open_capture(project, IngestConfig())
 
 
-@pytest.mark.parametrize("what", ["fifo", "device"])
-@pytest.mark.parametrize("name", ["view3.png", "notes.txt", "masks/view3.png"])
-def test_what_is_no_regular_file_is_named_at_once(images: Path, tmp_path: Path, what: str, name: str) -> None:
+@pytest.mark.parametrize("what", ["fifo", "device", "broken link"])
+@pytest.mark.parametrize("name", ["view3.png", "notes.txt"])
+def test_what_is_no_regular_file_is_left_out_by_name(images: Path, what: str, name: str) -> None:
     place = images / name
-    place.parent.mkdir(exist_ok=True)
     place.unlink(missing_ok=True)
     if what == "fifo":
         os.mkfifo(place)
     else:
-        place.symlink_to("/dev/zero")
+        place.symlink_to("/dev/zero" if what == "device" else "gone.png")
+    capture = open_capture(images, IngestConfig())
+    named = "1 file that cannot be opened (view3.png)"
+    assert (named in capture.told) == any(named in note for note in capture.notes) == (name == "view3.png")
+    assert len(capture.frames) == 9 + (name != "view3.png")
+    externals(images, IngestConfig())
+
+
+@pytest.mark.parametrize("name", ["masks/view3.png", "masks/notes.txt"])
+def test_a_mask_that_is_no_regular_file_is_named_at_once(images: Path, tmp_path: Path, name: str) -> None:
+    (images / "masks").mkdir()
+    os.mkfifo(images / name)
     with DigestMemo(tmp_path / "memo.json") as memo, pytest.raises(InputError, match="not a regular file"):
         digests(images, memo)

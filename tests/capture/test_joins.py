@@ -72,6 +72,17 @@ def off(model: pycolmap.Reconstruction, right: pycolmap.Reconstruction) -> list[
     ]
 
 
+def test_a_join_is_checked_once_where_nothing_was_placed_in_between(
+    placer: sfm_worker.Sfm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every capture whose frames were all placed at first printed "checking a weak join" twice."""
+    phases: list[str] = []
+    monkeypatch.setattr(sfm_worker, "_JOINED", 1.01)  # all joins are weak
+    placer._report = lambda **said: phases.append(said.get("phase", ""))
+    placer.mapped(placer.pairs())
+    assert phases.count("checking a weak join") == 1
+
+
 def test_a_part_at_another_scale_is_placed_again(placer: sfm_worker.Sfm) -> None:
     right = placer._map()
     assert placer._rejoined(right, placer.database) is right

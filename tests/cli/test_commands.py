@@ -12,11 +12,12 @@ import time
 from pathlib import Path
 from typing import Literal
 
+import click
 import numpy as np
 import pytest
 from toy import Bench
 
-from cleargs.cli.main import COMMANDS, explanation, invoke
+from cleargs.cli.main import COMMANDS, cli, explanation, invoke
 from cleargs.cli.outcome_lines import outcome_lines
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.run import without_effect
@@ -219,6 +220,9 @@ def test_show(shell: Shell) -> None:
     code, out, _ = shell("show", folder)
     assert code == 0 and "complete" in out and "total 55" in out
     assert json.loads(shell("show", folder, "square", "--json")[1])["summary"] == {"total": 55}
+    code, out, _ = shell("show", folder, "time")
+    assert code == 0 and out.split()[:2] == ["part", "seconds"]
+    assert set(json.loads(shell("show", folder, "time", "--json")[1])) >= {"square"}
 
 
 def test_show_and_status_after_a_change(shell: Shell) -> None:
@@ -321,6 +325,16 @@ def test_help_of_every_command_teaches(capsys: pytest.CaptureFixture[str]) -> No
     for name in COMMANDS:
         assert invoke([name, "--help"]) == 0
         assert f"Usage: cleargs {name}" in capsys.readouterr().out
+
+
+def test_commands_that_write_can_be_quiet() -> None:
+    writers = {"run", "batch", "demo", "report", "render", "export", "pack", "eval", "synth", "stage"}
+    context = click.Context(cli)
+    commands = {name: cli.get_command(context, name) for name in COMMANDS}
+    options = {
+        name: {option for one in found.params for option in one.opts} for name, found in commands.items()
+    }
+    assert {name for name, found in options.items() if {"-q", "--progress", "--log"} <= found} == writers
 
 
 def test_help_and_no_op_import_nothing_heavy(shell: Shell) -> None:

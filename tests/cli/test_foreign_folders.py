@@ -185,6 +185,22 @@ def test_a_run_keeps_its_log_next_to_a_backup_of_hard_links(
     )
 
 
+@pytest.mark.parametrize("command", ["status", "run"])
+def test_a_run_of_another_does_not_make_commands_search_the_disk(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    """Its ``run.toml`` may name any folder as the input."""
+    bench.run()
+    home = write(bench.root / "home" / "0.txt").parent
+    for index in range(30):
+        write(home / f"{index}/{index}.txt")
+    text = (bench.folder / "run.toml").read_text()
+    write(bench.folder / "run.toml", text.replace(f'"{bench.capture}"', f'"{home}"'))
+    monkeypatch.setattr("cleargs.digest.MAX_FILES", 20)
+    assert invoke([command, str(bench.folder)], bench.dag) == 2
+    assert "it is not one capture" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["w" * 5000, "..", "a/b", ""])
 def test_a_progress_file_has_bounds(bench: Bench, name: str) -> None:
     bench.run()

@@ -135,9 +135,23 @@ def test_metrics_that_are_not_installed(
 ) -> None:
     monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path / "none"))
     code, out, _ = shell(run, "--reference", truth, "--threads", "1", "-q")
-    assert code == 0 and "lpips_alex: not installed: run `cleargs models install lpips` once" in out
+    assert (
+        code == 0 and "lpips_alex, lpips_vgg: not installed: run `cleargs models install lpips` once" in out
+    )
+    assert out.count("models install lpips") == 1  # one line for both
     document = json.loads((run / "eval" / "truth" / "eval.json").read_text())["evaluations"][0]
     assert document["means"]["lpips_alex"] is None and document["means"]["clarity-net"] is not None
+
+
+def test_one_figure_per_line(shell: Shell, run: Path, truth: Path) -> None:
+    """All figures beside the table were one line of 200 letters, which ended in "dB from black"."""
+    _, out, _ = shell(run, "--reference", truth, *FAST)
+    _, _, after = out.partition("\nrivr:\n")
+    lines = after.splitlines()
+    assert [
+        line.partition(":")[0] for line in lines if line.startswith("  over") or "background" in line
+    ] == ["  over white", "  its background against white"]
+    assert all(len(line) <= 80 and line.count(" dB") <= 1 for line in lines if line.startswith("  "))
 
 
 def test_a_scene_says_how_many_of_its_views_it_was_trained_on(shell: Shell, run: Path, truth: Path) -> None:

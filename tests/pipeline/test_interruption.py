@@ -93,11 +93,14 @@ def test_interrupted_run_says_so_and_resumes(bench: Bench, number: signal.Signal
     assert "same command" in errors and "Traceback" not in errors
     bench.work_done()
     (noted,) = (bench.store / "work").glob("*/seconds")
-    before = float(noted.read_text())
-    assert before > 0.0
+    clock, processor, compiling = map(float, noted.read_text().split())
+    assert clock > 0.0 and processor > 0.0 and compiling == 0.0
+    noted.write_text(f"{clock} 100 7")
     bench.run()
     assert "square 0.txt" not in bench.work_done()
-    assert read_manifest(bench.folder / "square").seconds >= before, "the time before the interruption counts"
+    made = read_manifest(bench.folder / "square")
+    assert made.seconds >= clock, "the time before the interruption counts"
+    assert (made.cpu_seconds or 0) >= 100 and made.compile_seconds == 7, "and so do its parts"
 
 
 def test_two_runs_of_different_inputs_in_one_folder(bench: Bench) -> None:

@@ -289,6 +289,15 @@ def test_estimates_follow_what_stages_took(bench: Bench) -> None:
     assert after_square == "new estimate: about 9 s", "half of 18 s: the stages take no time here"
 
 
+def test_stages_without_work_are_not_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A draft printed "rivr: started", "new estimate: about 0 s ()" and "no repairs are made"."""
+    monkeypatch.setattr(bench.dag.load("total"), "idle", lambda config: True, raising=False)
+    bench.run()
+    assert (bench.folder / "total").exists()
+    told = [line for line in bench.remarks.lines if "total" in line or "estimate" in line]
+    assert [line.partition(":")[0] for line in told] == ["estimate", "new estimate"]
+
+
 def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_path: Path) -> None:
     bench.run()
     other = tmp_path / "other"

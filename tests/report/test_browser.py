@@ -266,6 +266,8 @@ def test_a_card_opens_the_layers_under_a_slider(wide: Report) -> None:
     page.locator('#strip .card[data-opens="0"]').press("Enter")
     assert page.locator("#inspector").is_visible()
     assert page.locator("#inspector-title").inner_text() == f"Frame 0 · {HOSTILE[0]}"
+    reason, *_ = page.locator("#inspector-role").inner_text().split(" · ")
+    assert "counts" in reason, "not the role, a term of the paper"
     assert page.locator("#left").get_attribute("alt") == "Frame 0: As filmed"
     assert page.locator("#right-layer").input_value() == "final"
     page.wait_for_function(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.formats import write_scene
 from cleargs.splat.render import Viewer
 from cleargs.splat.spz import SpzVersion
+from cleargs.splat.transforms import transform_scene
 
 PACKAGES = Path(__file__).parents[2] / ".oracles/node_modules"
 ENGINES = ("playcanvas/build/playcanvas.min.mjs", "@sparkjsdev/spark/dist/spark.module.js")
@@ -96,6 +99,11 @@ window.spark = async (content, name, pose, fov) => {
 };
 window.ready = true;
 </script>"""
+PLACES = {
+    "three": ("https://cdn.jsdelivr.net/npm/three@{}/", "."),
+    "@sparkjsdev/spark": ("https://sparkjs.dev/releases/spark/{}/", "dist"),
+}
+"""Package -> its address in docs/viewers.md, with the version, and the folder that is there."""
 ZSTD = """window.ZstdDecoderModule = async () => {
   const { decompress } = await import("/fzstd/esm/index.mjs");
   return { decompress: (source, size) => decompress(source, new Uint8Array(size)) };
@@ -149,3 +157,48 @@ def test_an_engine_draws_the_scene_as_we_do(
     ours = Viewer(scene).view(view).astype(np.float64)
     assert theirs.shape == ours.shape and theirs.std() > 20
     assert np.abs(theirs - ours).mean() < DIFFERENCE
+
+
+def test_the_page_of_the_documentation_draws_an_export(browser: Any, tmp_path: Path) -> None:
+    """As it stands, with the versions that it names, from the disk in place of their addresses."""
+    text = (PACKAGES.parents[1] / "docs/viewers.md").read_text(encoding="utf-8")
+    (html,) = re.findall(r"(?ms)^```html\n(.*?)^```", text)
+    first = camera(1)
+    pose = {"rotation": first.world_to_camera[:3, :3], "translation": first.world_to_camera[:3, 3]}
+    scene = transform_scene(wall(2, sh_degree=3), scale=1.0, **pose)  # as `--for web` places it
+    write_scene(tmp_path / "walk.spz", scene, "spz")
+    version = {name: json.loads((PACKAGES / name / "package.json").read_text())["version"] for name in PLACES}
+    page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+    complaints: list[str] = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+
+    def answer(route: Any) -> None:
+        url = route.request.url
+        if url == ADDRESS:
+            return route.fulfill(content_type="text/html", body=html)
+        if url == f"{ADDRESS}walk.spz":
+            return route.fulfill(path=tmp_path / "walk.spz")
+        for name, (begin, folder) in PLACES.items():
+            begin = begin.format(version[name])
+            if url.startswith(begin):
+                return route.fulfill(path=PACKAGES / name / folder / url.removeprefix(begin))
+        complaints.append(f"asked for {url}")
+        return route.abort()
+
+    page.route("**/*", answer)
+    page.goto(ADDRESS)
+    side = SIZE[1] / 2 / np.tan(np.radians(30))
+    ours = (
+        Viewer(scene).view(Camera(*SIZE, side, side, SIZE[0] / 2, SIZE[1] / 2, np.eye(4))).astype(np.float64)
+    )
+    difference, limit = np.inf, 1.5 * DIFFERENCE  # measured: 11.4
+    assert np.abs(ours[:, ::-1] - ours).mean() > 2 * limit
+    for _ in range(60):
+        page.wait_for_timeout(250)
+        png = page.screenshot()
+        theirs = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR_RGB).astype(np.float64)
+        difference = np.abs(theirs - ours).mean()
+        if complaints or difference < limit:
+            break
+    page.close()
+    assert complaints == [] and difference < limit

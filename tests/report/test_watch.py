@@ -164,6 +164,9 @@ def test_a_report_folder_that_is_a_link_elsewhere(tmp_path: Path) -> None:
     (made.folder / "report").symlink_to(made.folder / "ingest")
     with serving(made) as port:
         assert ask(port, "/report/manifest.json").status == 404
+        (made.folder / "report").unlink()
+        (made.folder / "report").symlink_to(made.folder / "run.toml")
+        assert ask(port, "/report").status == 404
 
 
 @pytest.mark.parametrize(
@@ -211,6 +214,8 @@ def test_the_address_is_local_and_errors_are_reported(finished: FinishedRun) -> 
             Server(finished.dag, finished.run, "127.0.0.1", int(server.server_address[1]))
     with pytest.raises(InputError, match="cannot serve at"):
         Server(finished.dag, finished.run, "no such host", 0)
+    with pytest.raises(InputError, match="the host has no name"):
+        Server(finished.dag, finished.run, "", 0)  # an unset variable: all addresses of the machine
 
 
 def test_open_shows_the_page_in_the_browser(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:

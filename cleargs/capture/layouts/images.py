@@ -7,12 +7,10 @@ from pathlib import Path
 
 from cleargs.capture.capture import Capture, External
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.contents import contents_of
+from cleargs.capture.contents import LISTS, contents_of
 from cleargs.capture.folders import chosen
 from cleargs.capture.other_files import remedy_in
 from cleargs.errors import InputError
-
-_LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
 
 
 def detect(source: Path, config: CaptureConfig) -> bool:
@@ -30,7 +28,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     frames = contents.frames()
     if not frames:
         raise InputError(f"{source} holds no images, no video and no transforms.json", hint=remedy_in(source))
-    patterns = [*(f"*/{name}" for name in _LISTS), "dense/*/sparse"] if config.uses_poses else []
+    patterns = [*(f"*/{name}" for name in LISTS), "dense/*/sparse"] if config.uses_poses else []
     nested = [path for pattern in patterns for path in sorted(source.glob(pattern))]
     notes = [f"poses in {path} are not read: give {path.parent} as the input" for path in nested[:1]]
     return Capture(

@@ -30,7 +30,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
     videos = contents_of(source, config).videos if source.is_dir() else [source]
     if len(videos) == 1:
         return {"capture": videos[0]}
-    return {"capture": {name: video for video, name in _names(videos, source).items()}}
+    return {"videos": {name: video for video, name in _names(videos, source).items()}}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:

@@ -40,6 +40,12 @@ const part = (title, text, data = []) => {
 
 const decibels = (frame) => (frame.psnr === null ? "" : `PSNR ${frame.psnr.toFixed(1)} dB`);
 
+// How much the frame counts and why, then its role, a term of the paper.
+const facts = (frame) => {
+  const role = frame.weight_text.includes(frame.role) ? "" : `role by RVA: ${frame.role}`;
+  return [frame.weight_text || "not rated", decibels(frame), role].filter(Boolean);
+};
+
 const describe = (frame) => {
   const scores = Object.entries(frame.scores).flatMap(([metric, found]) =>
     Object.entries(found).map(([name, value]) => [`${report.layers[name] ?? name}, ${metric}`, value]));
@@ -49,7 +55,7 @@ const describe = (frame) => {
   return {
     view: `Frame ${frame.id}`,
     title: `Frame ${frame.id} · ${frame.name}`,
-    role: [frame.role || "not rated", decibels(frame)].filter(Boolean).join(" · "),
+    role: facts(frame).join(" · "),
     details: [
       part("Weight in training", frame.weight_text || "not rated", [...pairs("Frame scores", figures), ...cues(frame)]),
       ...(frame.worst ? [part("Worst cue, from 0 (good) to 1 (bad)", frame.worst)] : []),
@@ -155,10 +161,8 @@ const describe = (frame) => {
     scrub.value = frames.indexOf(frame);
     lanes.style.setProperty("--at", scrub.value);
     scrub.setAttribute("aria-valuetext", `frame ${frame.id}`);
-    const role = frame.weight_text.includes(frame.role) ? "" : `role by RVA: ${frame.role}`;
-    const facts = [frame.weight_text || "not rated", decibels(frame), role];
-    if (frame.time === null) facts.push("its camera is not known");
-    one("#readout").replaceChildren(make("b", `Frame ${frame.id}`), make("span", facts.filter(Boolean).join(" · ")));
+    const shown = [...facts(frame), ...(frame.time === null ? ["its camera is not known"] : [])];
+    one("#readout").replaceChildren(make("b", `Frame ${frame.id}`), make("span", shown.join(" · ")));
     const filmed = one("#filmed");
     if (filmed) {
       filmed.src = asset(frame.layers.observed);

@@ -186,4 +186,7 @@ def normal_equations(
                 side[n] += scaled * left
                 for m in range(unknowns):  # the whole row, which is faster than its part up to n
                     matrix[n, m] += scaled * asked[m]
-        matrices[y], sides[y] = matrix, side
+        for n in range(unknowns):  # as loops, which compile in half the time of two assignments
+            sides[y, n] = side[n]
+            for m in range(unknowns):
+                matrices[y, n, m] = matrix[n, m]

@@ -51,7 +51,13 @@ def kernel_digest() -> str:
 
 def compiled_mark(device: str) -> Path:
     """Return the file that says that all kernels for ``device`` have been compiled once on this machine."""
-    return kernel_cache.cache_folder(f"kernels-{kernel_digest()}") / f"compiled-{device}"
+    name = f"compiled-{device}-{kernel_cache.installation()}"
+    return kernel_cache.cache_folder(f"kernels-{kernel_digest()}") / name
+
+
+def is_compiled(device: str) -> bool:
+    """Return True if all kernels for ``device`` have been compiled on this machine."""
+    return compiled_mark(device).exists()
 
 
 def configure_numba() -> None:
