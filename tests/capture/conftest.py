@@ -53,10 +53,13 @@ Ingest = Callable[..., Ingested]
 def ingest_in(tmp_path: Path, cache: Path | None = None) -> Ingest:
     """Return a function that runs the stage in a folder: ``ingest(source, name, threads=1, **settings)``.
 
-    ``cache`` is the folder of the models that ingest has found before (None: one below ``tmp_path``).
+    ``cache`` is the folder of the models that ingest has found before (None: ``kept`` below ``tmp_path``). A
+    test that compares two calculations of the same names two folders.
     """
 
-    def run(source: Path, name: str = "out", *, threads: int = 1, **settings: Any) -> Ingested:
+    def run(
+        source: Path, name: str = "out", *, threads: int = 1, kept: str = "kept", **settings: Any
+    ) -> Ingested:
         out, work = tmp_path / name, tmp_path / f"{name}.work"
         out.mkdir(exist_ok=True)
         work.mkdir(exist_ok=True)
@@ -69,7 +72,7 @@ def ingest_in(tmp_path: Path, cache: Path | None = None) -> Ingest:
             externals={},
             out=out,
             checkpoints=work,
-            cache=cache or tmp_path / "kept",
+            cache=cache or tmp_path / kept,
             seed=0,
             device="cpu",
             threads=threads,

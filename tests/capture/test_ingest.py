@@ -159,7 +159,7 @@ def test_poses_that_the_images_contradict_are_adjusted(shaken: Path, ingest: Ing
     assert off[0][0] > 0.5 and off[1][0] < 0.1
     assert off[0][1] > 0.015 and off[1][1] < 0.008
     assert len(load_points(adjusted.out).xyz) > len(load_points(kept.out).xyz)
-    assert same_bytes(adjusted.out, ingest(shaken, "again", threads=2).out)
+    assert same_bytes(adjusted.out, ingest(shaken, "again", threads=2, kept="other").out)
 
 
 def test_what_a_rolling_shutter_does_is_not_put_down_to_the_poses(posed: Path, ingest: Ingest) -> None:
@@ -252,7 +252,9 @@ def test_sfm_finds_the_arc(images: Path, placed: Ingested, ingest: Ingest) -> No
 
 def test_sequential_matching_is_reproducible(images: Path, ingest: Ingest) -> None:
     settings = {"exhaustive_below": 0, "overlap": 2, "loop_candidates": 2}
-    one, two = (ingest(images, f"t{threads}", threads=threads, **settings) for threads in (1, 2))
+    one, two = (
+        ingest(images, f"t{threads}", threads=threads, kept=f"k{threads}", **settings) for threads in (1, 2)
+    )
     assert one.result.summary["registered"] == 10
     assert same_bytes(one.out, two.out)
 
@@ -407,7 +409,7 @@ def test_blurred_frames_are_placed_at_half_resolution(images: Path, ingest: Inge
     assert done.result.summary["placed"] == {"sfm": 8, "sfm at half resolution": 2}
     # The arc is 2.4 long. The blur covers 25 px, 0.3 at the depth of the planes; what is left of it is 0.06.
     assert errors_of_poses(done.out)[1] < 0.1
-    assert same_bytes(done.out, ingest(images, "again", threads=2).out)
+    assert same_bytes(done.out, ingest(images, "again", threads=2, kept="other").out)
 
 
 def test_dark_frames_get_fainter_features(images: Path, ingest: Ingest) -> None:

@@ -8,8 +8,8 @@ import torch
 from cleargs.scene.config import G0Config
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.schedule import INRIA_STEPS, Schedule, rate_factor
+from cleargs.stages.config import RivrConfig, RoundsConfig
 from cleargs.stages.consolidate import FinalDistilConfig
-from cleargs.stages.rivr import RivrConfig, RoundsConfig
 
 GROUPS = ("means", "log_scales", "rotations", "sh", "logit_opacities")
 
