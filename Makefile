@@ -109,7 +109,7 @@ browser: .venv/browser.stamp
 
 oracles: .oracles/stamp
 
-# Rebuilt each time, because npm does not restore files that were deleted below.
+# Installed again each time, because npm does not replace files that were deleted below.
 .oracles/stamp: Makefile
 	rm -rf .oracles
 	npm install --prefix .oracles --ignore-scripts --silent \

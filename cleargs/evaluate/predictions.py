@@ -1,4 +1,4 @@
-"""The image of a scene at the view of a reference, and the measures of it that need more than its pixels."""
+"""The image of a scene at a reference's view, and the other measures of it."""
 
 from __future__ import annotations
 
