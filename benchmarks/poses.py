@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cleargs.capture import sfm_worker
-from cleargs.capture.adjustment import FULL_LENS, Adjuster, align_to, median_residual, set_lens
+from cleargs.capture.adjustment import Adjuster, align_to, median_residual, set_lens
+from cleargs.capture.camera_models import FULL_LENS
 from cleargs.capture.cameras import Pose, normalise, pinhole
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import CaptureConfig, SfmConfig

@@ -9,16 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.capture.camera_models import FIRST_LENS, FULL_LENS, SIMPLE
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import copy_without_features
 from cleargs.capture.kept_out import epipolar_errors, keep_out
 from cleargs.capture.prediction import Tracks
-
-FIRST_LENS, FULL_LENS = "SIMPLE_RADIAL", "OPENCV"
-"""Camera models: one focal length and one radial term; two focal lengths, and two radial and two tangential
-terms."""
-
-_SIMPLE = {"SIMPLE_PINHOLE", "PINHOLE", FIRST_LENS}  # models without distortion terms that `FIRST_LENS` lacks
 
 SHARED_BY = 8
 """Minimum number of frames per camera to adjust the cameras of the input, not only its poses."""
@@ -93,7 +88,7 @@ class Adjuster:
         Returns None if every frame sees too few points.
         """
         refined = copy.deepcopy(model)
-        if cameras and {camera.model.name for camera in refined.cameras.values()} <= _SIMPLE:
+        if cameras and {camera.model.name for camera in refined.cameras.values()} <= SIMPLE:
             set_lens(refined, FIRST_LENS)
         # At better poses more features find their points: adjustment and triangulation alternate.
         for _ in range(_ROUNDS):

@@ -16,17 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cleargs.capture.camera_models import MODELS
 from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
 
 if TYPE_CHECKING:
     from cleargs.capture.colmap import pycolmap
-
-_FISHEYE = frozenset(
-    {"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FOV"}
-)
-_MODELS = _FISHEYE | {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
-"""Supported COLMAP models. Those of `_FISHEYE` bend straight lines even if all distortion terms are 0."""
 
 MAX_ASPECT, MIN_FOCAL, MAX_FOCAL = 1.1, 0.3, 5.0
 """Largest ratio of fx and fy, and range of the focal length in long sides, of a lens that is believed."""
@@ -57,7 +52,7 @@ class Intrinsics:
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if self.model not in _MODELS:
+        if self.model not in MODELS:
             raise InputError(
                 f"camera model {self.model} is not supported",
                 hint="undistort the images first, or use a perspective or OpenCV fisheye model",
@@ -89,7 +84,7 @@ class Intrinsics:
     @property
     def is_fisheye(self) -> bool:
         """Return True for a model that can see 90 degrees and more off its axis."""
-        return self.model in _FISHEYE
+        return MODELS[self.model].fisheye
 
     @property
     def is_pinhole(self) -> bool:

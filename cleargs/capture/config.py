@@ -9,10 +9,8 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from cleargs.base_model import FrozenModel
+from cleargs.capture.camera_models import SfmModel
 from cleargs.plugins import require_known
-
-SfmModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
-
 
 _FOCAL, _DEGREES = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(|px|deg|degrees|°)\s*"), ("deg", "degrees", "°")
 _WIDEST = math.radians(170)  # field of view with which a perspective lens starts at most

@@ -23,7 +23,6 @@ from cleargs.capture.prediction import WITHIN_PX, prediction_errors
 from cleargs.capture.sfm_job import Job, Prediction
 from cleargs.types import ArrayF64
 
-FISHEYE = "OPENCV_FISHEYE"
 DOUBTFUL = 0.8
 """Share of the kept-out keypoints within `WITHIN_PX` below which other lenses are tried."""
 GAIN = 0.9

@@ -18,7 +18,7 @@ from typing import Any, get_args
 import numpy as np
 
 from cleargs.capture import known_models
-from cleargs.capture.adjustment import FIRST_LENS
+from cleargs.capture.camera_models import FIRST_LENS, SfmModel
 from cleargs.capture.cameras import (
     COLMAPS_GUESS,
     MAX_ASPECT,
@@ -32,7 +32,7 @@ from cleargs.capture.cameras import (
     upright,
 )
 from cleargs.capture.child import run_child
-from cleargs.capture.config import SfmConfig, SfmModel
+from cleargs.capture.config import SfmConfig
 from cleargs.capture.database import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame

@@ -22,15 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from cleargs.capture.adjustment import (
-    FIRST_LENS,
-    SHARED_BY,
-    Adjuster,
-    adjust_all,
-    align_to,
-    lens_of,
-    median_residual,
-)
+from cleargs.capture.adjustment import SHARED_BY, Adjuster, adjust_all, align_to, lens_of, median_residual
+from cleargs.capture.camera_models import FIRST_LENS, FISHEYE
 from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
@@ -49,7 +42,7 @@ from cleargs.capture.kept_out import (
     verified_matches,
     weakest_join,
 )
-from cleargs.capture.lenses import FISHEYE, FISHEYE_AHEAD, GAIN, Fit, fitted, searched
+from cleargs.capture.lenses import FISHEYE_AHEAD, GAIN, Fit, fitted, searched
 from cleargs.capture.parallax import shows_depth
 from cleargs.capture.prediction import scales_differ
 from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings

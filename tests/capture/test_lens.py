@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from cleargs.capture import adjustment
+from cleargs.capture.camera_models import FIRST_LENS, FISHEYE, FULL_LENS, MODELS, SfmModel
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import set_cameras
 
@@ -35,7 +37,7 @@ def capture(database: Path, lens: str, params: list[float]) -> pycolmap.Reconstr
     with pycolmap.Database.open(database) as opened:
         model = pycolmap.synthesize_dataset(options, opened)
         pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model, opened)
-    adjustment.set_lens(model, adjustment.FIRST_LENS)
+    adjustment.set_lens(model, FIRST_LENS)
     return model
 
 
@@ -56,7 +58,7 @@ def test_few_frames_measure_the_lens(
     model = capture(tmp_path / "matches.db", lens, params)
     measured, _ = adjustment.Adjuster(tmp_path / "matches.db", triangulate).with_measured_lens(model)
 
-    changed = lens == adjustment.FULL_LENS
+    changed = lens == FULL_LENS
     assert frames == [FEW] * 3 + [FRAMES] * 2 * changed
     assert (measured is model) != changed
     assert adjustment.lens_of(measured) == lens
@@ -74,3 +76,9 @@ def test_a_wrong_focal_length_of_the_exif_is_left_out(images: Path, ingest: Inge
     assert done.result.summary["registered"] == 10
     assert done.result.summary["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.05)
     assert any("EXIF" in line for line in done.warnings)
+
+
+def test_the_models_that_sfm_fits_are_those_of_the_table() -> None:
+    fitted = {name for name, facts in MODELS.items() if facts.fitted}
+    assert {*get_args(SfmModel)} == {"auto", *fitted} and {FIRST_LENS, FULL_LENS, FISHEYE} <= fitted
+    assert MODELS.keys() <= pycolmap.CameraModelId.__members__.keys()

@@ -9,6 +9,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from cleargs.capture.camera_models import BY_TRANSFORMS, FISHEYE
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import (
@@ -26,9 +27,6 @@ from cleargs.safe_io import FAULTS, faults_as, read_json
 
 if TYPE_CHECKING:
     from cleargs.capture.cameras import Intrinsics, Pose
-
-_FISHEYE = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
-_PERSPECTIVE = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"})
 
 
 class _Entry(NamedTuple):
@@ -145,10 +143,11 @@ def _camera(values: Mapping[str, Any], image: Path) -> Intrinsics:
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         k1, k2, k3, k4, p1, p2 = (float(values.get(key) or 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(values.get("camera_model", "OPENCV")).upper()
-    if model in _FISHEYE or values.get("is_fisheye"):
-        return Intrinsics("OPENCV_FISHEYE", width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
-    if model not in _PERSPECTIVE or k4:
-        what = f"camera_model {model}" if model not in _PERSPECTIVE else "a perspective camera with k4"
+    known = BY_TRANSFORMS.get(model)
+    if (known is not None and known.fisheye) or values.get("is_fisheye"):
+        return Intrinsics(FISHEYE, width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
+    if known is None or k4:
+        what = f"camera_model {model}" if known is None else "a perspective camera with k4"
         raise InputError(
             f"{what} is not supported", hint="undistort the images first, or use OPENCV or OPENCV_FISHEYE"
         )
