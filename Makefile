@@ -109,7 +109,7 @@ browser: .venv/browser.stamp
 
 oracles: .oracles/stamp
 
-# Anew each time, because npm does not bring back files that were deleted below.
+# Installed again each time, because npm does not replace files that were deleted below.
 .oracles/stamp: Makefile
 	rm -rf .oracles
 	npm install --prefix .oracles --ignore-scripts --silent \

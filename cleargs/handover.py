@@ -157,7 +157,7 @@ def _write_model(
     images = {
         key + 1: replace(model.images[origin[key].frame_id + 1], name=name) for key, name in names.items()
     }
-    write_model(folder, replace(model, images=images), points.rgb)
+    write_model(folder, replace(model, images=images), points.observed_rgb)
 
 
 def write_points(path: Path, points: Points) -> None:

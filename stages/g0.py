@@ -10,6 +10,8 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.scene.config import G0Config
 from cleargs.scene.folder import LOG, TRAINED
 
+from .config import kernel_libraries
+
 VERSION = 48
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
@@ -27,6 +29,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
 OUTPUTS = (*TRAINED, LOG)
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
+other_libraries = kernel_libraries
 
 
 def externals(config: G0Config, source: Path) -> Mapping[str, Path]:

@@ -55,7 +55,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
 FEW_FRAMES, GOOD_FRAMES = 20, 30
 """Number of frames below which a warning is given, and the number that it asks for."""
 
-VERSION = 21
+VERSION = 22
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -126,6 +126,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, rotate and reduce them, find poses or use the given ones, undistort and publish."""
     from cleargs.capture.choice import held_out, holdout_hash, select_sharp_frames
     from cleargs.capture.known_models import file_of
+    from cleargs.capture.loose_points import in_scene
     from cleargs.capture.measuring import measure_motion, write_motion
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
@@ -178,7 +179,11 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     if config.holdout == "none":
         test = {index for index, frame in enumerate(frames) if frame.source.test}
     outcome = scene.outcome
-    model = publish(frames, scene.model, outcome, test, work, context.out, config.max_size, reporter)
+    loose = None
+    if capture.loose is not None and outcome.method != "sfm":
+        loose = in_scene(capture.loose, scene.similarity, scene.model)
+        reporter.info(f"{0 if loose is None else len(loose.xyz)} points of the input start Gaussians")
+    model = publish(frames, scene.model, outcome, test, work, context.out, config.max_size, reporter, loose)
     write_motion(context.out / "motion.parquet", frames, motion)
     return StageResult(
         missing=contradictions(outcome, config, reporter),

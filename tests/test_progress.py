@@ -64,7 +64,7 @@ def seconds_left(monkeypatch: pytest.MonkeyPatch, steps: list[tuple[float, int]]
 
 
 def test_the_remaining_time_follows_the_load(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After other programs ended, "2.6 it/s, 806 s left" stood beside 430 steps that took 165 s."""
+    """After other programs ended, "2.6 it/s, 806 s left" was printed for 430 steps that took 165 s."""
     slow = [(float(t), t // 2) for t in range(2, 602, 2)]  # 300 steps at half a step per second
     fast = [(600.0 + t, 300 + 3 * t) for t in range(1, 202)]
     left = seconds_left(monkeypatch, slow + fast)

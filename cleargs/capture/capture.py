@@ -12,6 +12,7 @@ from cleargs.files import External as External
 
 if TYPE_CHECKING:
     from cleargs.capture.cameras import Intrinsics, Pose
+    from cleargs.capture.loose_points import LoosePoints
     from cleargs.capture.model import SparseModel
 
 
@@ -46,6 +47,8 @@ class Capture:
     """Frames in the input, before choosing."""
     model: SparseModel | None = None
     """The sparse model of a COLMAP project, where it has points."""
+    loose: LoosePoints | None = None
+    """Its points, if no image observes them."""
     hdr: str | None = None
     """``pq`` or ``hlg`` for an HDR video, which is tone-mapped."""
     stretch: tuple[float | None, float | None] = (None, None)

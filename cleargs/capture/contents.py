@@ -16,6 +16,21 @@ from pathlib import Path
 
 from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
+from cleargs.capture.file_names import (
+    BAND,
+    BLURRED,
+    INFRARED_NAME,
+    MAP,
+    MASK_FOLDER,
+    PREVIEW,
+    PROCESSED,
+    PRODUCT_NAME,
+    SECOND,
+    SMALL_VIDEO,
+    SPOT_NAME,
+    SYSTEM,
+    of_shot,
+)
 from cleargs.capture.folders import (
     frame_key,
     is_wanted,
@@ -39,37 +54,8 @@ of their number, or if they have the numbers of others in their names."""
 
 _REDUCED = 0.75  # share of the long side up to which a folder with the names of another one has copies
 
-_SYSTEM = re.compile(r"[.@#]|(__MACOSX|MeshroomCache|odm_\w+|.+\.(files|cmvs))$")
-"""Names of hidden folders, of network disks' own, and of the work of Meshroom, ODM, Metashape, VisualSFM."""
 LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
 """Files and folders with poses, by which a folder is a capture."""
-_MASK_FOLDER = re.compile(r"(.+[._-])?masks?", re.IGNORECASE)
-_PROCESSED = re.compile(
-    r"correct|undist|rectif|edit|resiz|enhanc|upscal|denois|sharpen|deblur|render|export|"
-    r"normal|semantic|segment|label|instance|albedo|depth|dispar|flow",
-    re.IGNORECASE,
-)
-_PREVIEW_NAME = re.compile(r"thumb|thmbnl|preview|poster|contact.?sheet", re.IGNORECASE)
-_EDITED = re.compile(r"IMG_E(\d+)|(.+)[-_ ]edited|(.+) \(\d+\)", re.IGNORECASE)
-"""Names of second versions: edited on iPhones, by Google Photos, and downloaded twice."""
-_BLURRED = (
-    (re.compile(r"(.+\.PORTRAIT-)\d+\.COVER"), r"\g<1>02.ORIGINAL"),
-    (re.compile(r"\d+l?PORTRAIT_\d+_(BURST\d+)_COVER"), r"00000PORTRAIT_00000_\1"),
-)
-"""Names of the portraits of a Pixel whose background it blurred, and those of the sharp ones next to them."""
-_BAND = re.compile(r"(.+)_(\d{1,2})")  # name of a picture of one spectral band (MicaSense)
-
-
-def _words(words: str, more: str = "$.") -> re.Pattern[str]:
-    """Return a pattern for names with one of ``words``, between other characters than letters."""
-    return re.compile(rf"(.*[\W\d_])?({words})([\W\d_].*)?|{more}", re.IGNORECASE)
-
-
-_MAP = _words("normals?|semantics?|seg|segmentation|labels?|instances?|albedo|depths?|disparity|flow|masked")
-_INFRARED = _words("infra(red)?|n?ir|thermal", r"DJI_.+_T(HRM)?")
-_SPOT = _words("sky.?box\\d*", r"\d*_?pano(rama)?s?")
-_PRODUCT = _words("screen.?shot|texture|diffuse|map_kd|ortho(photo|mosaic)?|dsm|dem|pano(rama)?")
-_SMALL_VIDEO = _words("lrv|proxy|proxies|low.?res")
 
 MASKS, DEPTH, GREY, INFRARED = "mask%s", "depth map%s", "picture%s of one channel", "infrared picture%s"
 ALONE = "mask%s without a photograph of the same name"
@@ -190,8 +176,10 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     top = [path for path in videos if path.parent == root] or videos
     left_out[BELOW] = _without(videos, top)
     videos = sorted(top, key=lambda path: natural_key(path.relative_to(root).as_posix()))
-    left_out[RAW] = [path for path in wanted if path.suffix.lower() in RAW_SUFFIXES]
     images = [path for path in wanted if path.suffix.lower() in IMAGE_SUFFIXES]
+    raw = [path for path in wanted if path.suffix.lower() in RAW_SUFFIXES]
+    stems = {of_shot(path) for path in images}
+    left_out[RAW] = [path for path in raw if of_shot(path) not in stems]
     left_out[UNREADABLE] = [path for path in images if lacks_package(path)]
     if len(left_out[UNREADABLE]) == len(images):  # reading the first one names the remedy
         left_out[UNREADABLE] = []
@@ -208,7 +196,7 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     left_out[SPECTRAL] = [path for path, header in headers.items() if header and header.spectral]
     if left_out[SPECTRAL] and len(left_out[SPECTRAL]) == len(headers) and not videos:
         raise InputError(f"{root} has only {SPECTRAL % 's'}", hint=_HINTS[SPECTRAL])
-    for kind, names in ((SPOT, _SPOT), (INFRARED, _INFRARED)):
+    for kind, names in ((SPOT, SPOT_NAME), (INFRARED, INFRARED_NAME)):
         headers = {path: header for path, header in headers.items() if path not in set(left_out[SPECTRAL])}
         left_out[kind] = _by_name(names, headers, root)
         headers = {path: header for path, header in headers.items() if path not in set(left_out[kind])}
@@ -220,11 +208,11 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     previews = _previews(images, headers, root, few=not videos)
     left_out[PREVIEWS] = [*previews, *small]
     images = _without(images, previews)
-    products = [path for path in images if _PRODUCT.fullmatch(path.stem)]
+    products = [path for path in images if PRODUCT_NAME.fullmatch(path.stem)]
     left_out[PRODUCTS] = products if len(products) <= _FEW * (len(images) - len(products)) else []
     images = _without(images, left_out[PRODUCTS])
     second = _copies(images, headers)
-    left_out[COPIES] = [*second, *copies]
+    left_out[COPIES] = [*second, *copies, *_without(raw, left_out[RAW])]
     images = _without(images, second)
     only_maps = any(header and header.deep for header in headers.values())
     only_maps &= all(_is_grey(headers[path]) for path in images)
@@ -244,7 +232,7 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
 def media_files(root: Path) -> list[Path]:
     """Return pictures and videos below ``root``, without hidden ones and those of runs."""
     suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
-    found = files_under(root, lambda folder: bool(_SYSTEM.match(folder.name)))
+    found = files_under(root, lambda folder: bool(SYSTEM.match(folder.name)))
     files = (path for path in found.values() if path.suffix.lower() in suffixes)
     return sorted(files, key=lambda path: (path.parent, path.name))
 
@@ -262,7 +250,7 @@ def _parts(path: Path, root: Path) -> tuple[str, ...]:
 def _mask_folder(path: Path, root: Path) -> Path | None:
     """Return the folder of masks below ``root`` that has the file ``path``, or None."""
     depth = len(root.parts)
-    found = (n for n, part in enumerate(path.parts[depth:-1], depth) if _MASK_FOLDER.fullmatch(part))
+    found = (n for n, part in enumerate(path.parts[depth:-1], depth) if MASK_FOLDER.fullmatch(part))
     return next((Path(*path.parts[: n + 1]) for n in found), None)
 
 
@@ -329,7 +317,7 @@ def _other_bands(images: Sequence[Path]) -> list[Path]:
     """Return the pictures of all bands but the first, if there are as many of each place (``IMG_0000_1``)."""
     places: dict[Path, dict[str, Path]] = defaultdict(dict)
     for path in images:
-        if found := _BAND.fullmatch(path.stem):
+        if found := BAND.fullmatch(path.stem):
             places[path.with_name(found[1])][found[2]] = path
     bands = {tuple(sorted(files)) for files in places.values()}
     if len(places) < FEWEST or len(bands) > 1 or sum(map(len, places.values())) < len(images):
@@ -340,7 +328,7 @@ def _other_bands(images: Sequence[Path]) -> list[Path]:
 
 def _small_videos(videos: Sequence[Path], root: Path) -> list[Path]:
     """Return the videos named as previews or proxies of others; none if there are no others."""
-    small = [path for path in videos if any(map(_SMALL_VIDEO.fullmatch, _parts(path, root)))]
+    small = [path for path in videos if any(map(SMALL_VIDEO.fullmatch, _parts(path, root)))]
     return small if len(small) < len(videos) else []
 
 
@@ -369,7 +357,7 @@ def _previews(
     small = [path for path in sizes if max(sizes[path]) <= _SMALL * max(main)]
     paired = [path for path in small if (path.parent, *re.findall(r"\d+", path.stem)) in numbers]
     found = small if len(small) <= _FEW * len(others) else paired
-    named = [path for path in others if any(map(_PREVIEW_NAME.search, _parts(path, root)[-2:]))]
+    named = [path for path in others if any(map(PREVIEW.search, _parts(path, root)[-2:]))]
     return sorted({*found, *(named if not few or len(named) <= _FEW * len(others) else [])})
 
 
@@ -389,7 +377,7 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
 
     def rank(folder: Path) -> tuple[bool, int]:
         pixels = sum(_pixels(headers[path]) for path in folders[folder].values())
-        return bool(_PROCESSED.search(folder.name)), -pixels
+        return bool(PROCESSED.search(folder.name)), -pixels
 
     for folder in sorted(folders, key=rank):
         files = folders[folder]
@@ -405,7 +393,7 @@ def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> li
 
 def _maps(images: Sequence[Path]) -> list[Path]:
     """Return pictures named, or in folders named, as normals, labels or depth, with the number of another."""
-    maps = [path for path in images if _MAP.fullmatch(path.stem) or _MAP.fullmatch(path.parent.name)]
+    maps = [path for path in images if MAP.fullmatch(path.stem) or MAP.fullmatch(path.parent.name)]
     numbers = {_numbers(path) for path in _without(images, maps)} - {()}
     return [
         path for path in maps if any(_numbers(path)[: n + 1] in numbers for n in range(len(_numbers(path))))
@@ -418,10 +406,10 @@ def _numbers(path: Path) -> tuple[str, ...]:
 
 def _is_second(path: Path, stems: Mapping[Path, Path]) -> bool:
     """Return True if ``path`` is named as an edited version of one of ``stems``, or is a second download."""
-    for pattern, sharp in _BLURRED:
+    for pattern, sharp in BLURRED:
         if (cover := pattern.fullmatch(path.stem)) and path.with_name(cover.expand(sharp)) in stems:
             return True
-    if (found := _EDITED.fullmatch(path.stem)) is None:
+    if (found := SECOND.fullmatch(path.stem)) is None:
         return False
     first = stems.get(path.with_name(f"IMG_{found[1]}" if found[1] else found[2] or found[3]))
     return first is not None and (found[3] is None or cmp(path, first, shallow=False))
@@ -439,6 +427,6 @@ def _is_copy(path: Path, other: Path, headers: Mapping[Path, Header | None]) -> 
     (w, h), (width, height) = own.size, its.size
     alike = abs(w * height - h * width) <= max(width, height) + max(w, h)
     smaller = max(w, h) <= _REDUCED * max(width, height)
-    processed = bool(_PROCESSED.search(path.parent.name))
+    processed = bool(PROCESSED.search(path.parent.name))
     changed = smaller or processed or path.suffix.lower() != other.suffix.lower()
     return alike and (changed or cmp(path, other, shallow=False))

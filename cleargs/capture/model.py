@@ -54,12 +54,15 @@ class SparseModel:
     error: NDArray[np.float64]  # [P] mean reprojection error, px
     dropped: int = 0
     """Number of points that were left out, because they are not finite or too far."""
+    rgb: NDArray[np.uint8] | None = None  # [P, 3] sRGB, of a model as it was read
 
     def select(self, which: NDArray[np.bool_]) -> SparseModel:  # [P]
         """Return the model with these points only, also in the images."""
         ids = self.point_ids[which]
         images = {key: image.select(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
-        return replace(self, images=images, point_ids=ids, xyz=self.xyz[which], error=self.error[which])
+        rgb = None if self.rgb is None else self.rgb[which]
+        error = self.error[which]
+        return replace(self, images=images, point_ids=ids, xyz=self.xyz[which], error=error, rgb=rgb)
 
     def moved(self, similarity: Similarity) -> SparseModel:
         """Return the model in another world; every point keeps its place in every image."""
@@ -198,6 +201,7 @@ def _converted(model: pycolmap.Reconstruction) -> SparseModel:
     point_ids = np.array([key for key, _ in points], np.int64)
     xyz = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
     errors = np.array([point.error for _, point in points], np.float64)
+    rgb = np.array([point.color for _, point in points], np.uint8).reshape(-1, 3)
     usable = np.isfinite(xyz).all(axis=1) & np.isfinite(errors)
     cameras = {
         key: Intrinsics(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist()))
@@ -207,7 +211,7 @@ def _converted(model: pycolmap.Reconstruction) -> SparseModel:
         key: _image(image, point_ids[usable]) for key, image in sorted(model.images.items()) if image.has_pose
     }
     dropped = int((~usable).sum())
-    return SparseModel(cameras, images, point_ids[usable], xyz[usable], errors[usable], dropped)
+    return SparseModel(cameras, images, point_ids[usable], xyz[usable], errors[usable], dropped, rgb[usable])
 
 
 def _image(image: pycolmap.Image, known: NDArray[np.int64]) -> ModelImage:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Intrinsics, guessed_camera
 from cleargs.capture.cutouts import resampled, write_cut_out
+from cleargs.capture.loose_points import LoosePoints
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import Prediction, SfmOutcome
@@ -34,13 +35,14 @@ def publish(
     out: Path,
     max_size: int,
     reporter: Reporter,
+    loose: LoosePoints | None = None,
 ) -> SparseModel:
     """Write images, masks, the three tables and the COLMAP model of the undistorted capture into ``out``.
 
     The colours of points are from train frames. Points are left out if no train frame shows them, or if fewer
     than two frames show them after undistortion cropped the images. Returns the published model. ``model`` is
     that of the working images in ``work``, ``outcome`` says how the pose of each was found or why there is
-    none, and ``test`` are the numbers of the test frames.
+    none, and ``test`` are the numbers of the test frames. The table of points ends with the ``loose`` ones.
     """
     make_folder(out / "images", empty=True)
     remove(out / "masks")  # without the folder, no frame has a mask
@@ -103,7 +105,7 @@ def publish(
         for index, (frame, camera) in enumerate(zip(frames, flat, strict=True))
     ]
     write_table(out / "frames.parquet", pa.Table.from_pylist(table, FRAMES), FRAMES)
-    _write_points(out, published, rgb_mean, counts[kept].astype(np.int32))
+    _write_points(out, published, rgb_mean, counts[kept].astype(np.int32), loose)
     write_model(out / "colmap" / "sparse" / "0", published, rgb_mean)
     return published
 
@@ -122,7 +124,11 @@ def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Intrinsics
 
 
 def _write_points(
-    out: Path, model: SparseModel, rgb: NDArray[np.uint8], track_length: NDArray[np.int32]
+    out: Path,
+    model: SparseModel,
+    rgb: NDArray[np.uint8],
+    track_length: NDArray[np.int32],
+    loose: LoosePoints | None,
 ) -> None:
     points = {
         "point_id": model.point_ids,
@@ -131,6 +137,13 @@ def _write_points(
         "error": model.error,
         "track_length": track_length,
     }
+    if loose is not None:
+        count = len(loose.xyz)
+        ids = int(model.point_ids.max()) + 1 + np.arange(count)
+        more = (ids, *loose.xyz.T, *loose.rgb.T, np.zeros(count), np.zeros(count, np.int32))
+        points = {
+            name: np.concatenate(both) for name, *both in zip(points, points.values(), more, strict=True)
+        }
     write_table(out / "points.parquet", pa.table(points, POINTS), POINTS)
     seen = [(key - 1, np.sort(image.point_ids)) for key, image in model.images.items()]
     observations = {

@@ -89,7 +89,7 @@ POINTS = pa.schema(
         *(column(axis, pa.float64(), "position in the normalised world") for axis in "xyz"),
         *(column(x, pa.uint8(), "sRGB, mean over the train frames that observe the point") for x in "rgb"),
         column("error", pa.float64(), "mean reprojection error, px of the image in which features are found"),
-        column("track_length", pa.int32(), "registered frames that observe the point"),
+        column("track_length", pa.int32(), "registered frames that observe the point; 0: a laser scanner's"),
     ]
 )
 
@@ -109,7 +109,12 @@ class Points:
     xyz: NDArray[np.float64]  # [P, 3]
     rgb: NDArray[np.uint8]  # [P, 3] sRGB
     error: NDArray[np.float64]  # [P] px
-    track_length: NDArray[np.int32]  # [P]
+    track_length: NDArray[np.int32]  # [P], 0: a point of the input that no image observes
+
+    @property
+    def observed_rgb(self) -> NDArray[np.uint8]:  # [S, 3]
+        """Colours of the points in the COLMAP model of ingest: those that frames observe."""
+        return self.rgb[self.track_length > 0]
 
 
 def load_frames(ingest_dir: Path) -> list[Frame]:

@@ -1,4 +1,4 @@
-"""What ``cleargs run`` prints at its end: the result, its quality, its time and the next command."""
+"""The last lines of ``cleargs run``: the result, its quality, its time and the next command."""
 
 from __future__ import annotations
 

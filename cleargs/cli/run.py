@@ -280,7 +280,7 @@ def status(dag: Stages, run: Path, store: Path | None, as_json: bool) -> None:
     settings = read_run_file(run, dag, store=store)
     if packed := read_pack(settings.folder):
         kept = Counter(file.partition("/")[0] for file in packed.files)
-        found = linked_manifests(settings.folder, dag.names).items()
+        found = linked_manifests(settings.folder, settings.stages(dag)).items()
         why = {name: f"{kept[name]} of {len(manifest.files) + 1} files" for name, manifest in found}
         print_plans([StagePlan(name, "packed", (text,)) for name, text in why.items()], as_json)
         click.echo(f"packed run: {WORKS}", err=as_json)

@@ -1,4 +1,4 @@
-"""The image of a scene at a reference's view, and what the evaluation measures of it beside its pixels."""
+"""The image of a scene at a reference's view, and the other measures of it."""
 
 from __future__ import annotations
 

@@ -18,10 +18,10 @@ class Stages:
     names: tuple[str, ...]
     load: Callable[[str], Stage]
     """Load a stage by name."""
-    prepare: Callable[[Collection[str]], None] = lambda names: None
-    """Start what the stages ``names`` will need on the CPU, next to those before them."""
     gpu_fault: Callable[[BaseException], str | None] = lambda error: None
     """Return one line about the GPU failure that caused an error; None if the GPU is not the cause."""
+    prepare: Callable[[Collection[str]], None] = lambda names: None
+    """Start what the stages ``names`` will need on the CPU, next to those before them."""
 
     def check(self, name: str) -> str:
         """Return ``name`` if it is a stage; raise InputError with the nearest name otherwise."""
@@ -40,7 +40,7 @@ class Stages:
 def installed() -> Stages:
     """Return the stages of the package ``cleargs.stages``. A module is imported when it is first used."""
     package = import_module("cleargs.stages")
-    return Stages(tuple(package.STAGES), load_stage, package.prepare, package.gpu_fault)
+    return Stages(tuple(package.STAGES), load_stage, package.gpu_fault, package.prepare)
 
 
 def load_stage(name: str) -> Stage:

@@ -115,7 +115,7 @@ class WorkFolder:
 
     @property
     def spent(self) -> Spent:
-        """What earlier attempts at this work took, as far as it was noted."""
+        """The time of earlier attempts at this work, as far as it was noted."""
         try:
             return Spent(*map(float, (self.folder / SECONDS).read_text(encoding="ascii").split()))
         except (OSError, ValueError, TypeError):

@@ -71,7 +71,7 @@ def write_sidecars(
         made = Path(name)
         write_json(made / f"{stem(output)}.cameras.json", cameras_json(cameras, **similarity))
         moved = transform_model(sparse, **similarity) if similarity else sparse
-        write_model(made / f"{stem(output)}.colmap/sparse/0", moved, load_points(ingest).rgb)
+        write_model(made / f"{stem(output)}.colmap/sparse/0", moved, load_points(ingest).observed_rgb)
         for inside, file in named_files(made).items():
             target, content = output.parent / inside, file.read_bytes()
             if target.is_file() and target.read_bytes() != content and not force:

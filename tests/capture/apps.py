@@ -463,3 +463,15 @@ def pixel_portraits(root: Path, pictures: Pictures, poses: Poses) -> None:
             burst = f"BURST202001011200{index:02d}000"
             save(root / f"IMG_{index}/00000PORTRAIT_00000_{burst}.jpg", picture)
             save(root / f"IMG_{index}/00100lPORTRAIT_00100_{burst}_COVER.jpg", blurred)
+
+
+def raw_and_jpeg(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Photographs in two formats (also of a Pixel), one twice, and overlays of a segmentation."""
+    for index, picture in enumerate(pictures):
+        name = (f"DSC{index:04d}", f"DSC{index:04d}")
+        if index % 2:
+            name = (f"PXL_{index:04d}.RAW-01.COVER", f"PXL_{index:04d}.RAW-02.ORIGINAL")
+        save(root / f"{name[0]}.jpg", picture)
+        (root / f"{name[1]}.dng").write_bytes(b"II*\0")
+        save(root / f"sam_vis/{name[0]}_vis.png", picture // 2)
+    save(root / "DSC0002 2.jpg", pictures[2])

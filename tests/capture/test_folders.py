@@ -90,6 +90,7 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "MicaSense": (apps.micasense, 10, "left out: 40 pictures of other spectral bands (0000SET/000/)"),
     "many bands": (apps.many_bands, 10, "left out: 10 pictures with other channels than red, green and blue"),
     "Matterport": (apps.matterport, 10, "6 pictures of panoramas from one spot (matterport_skybox_images/)"),
+    "raw": (apps.raw_and_jpeg, 10, "10 photographs; left out: 21 second pictures"),
     "Pixel": (apps.pixel_portraits, 10, "left out: 10 second pictures"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }

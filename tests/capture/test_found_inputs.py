@@ -12,11 +12,14 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.spatial import KDTree
 
+from cleargs.capture.cameras import Similarity
 from cleargs.capture.choice import select_sharp_frames
+from cleargs.capture.loose_points import LoosePoints, in_scene
 from cleargs.capture.model import read_model, write_model
 from cleargs.capture.sources import externals, open_capture
-from cleargs.capture.tables import load_frames
+from cleargs.capture.tables import load_frames, load_points
 from cleargs.errors import InputError, StageError
 from cleargs.media.encode import write_video
 from cleargs.progress import SilentReporter
@@ -167,6 +170,21 @@ def test_models_without_tracks_are_triangulated(project: Path, ingest: Ingest, f
     assert done.result.summary["registered"] == 10 and done.result.summary["points"] > 100
     assert done.result.summary["poses"] == "given"
     assert any("no two images see" in line for line in done.warnings) == (what == "no tracks")
+    table = load_points(done.out)
+    loose = table.track_length == 0
+    assert (loose.sum() > 0.9 * len(bare)) if what == "no tracks" else not loose.any()
+    assert np.unique(table.point_id).size == len(loose) and len(table.observed_rgb) == (~loose).sum()
+    assert np.median(KDTree(table.xyz[~loose]).query(table.xyz[loose])[0] if loose.any() else 0) < 0.02
+
+
+def test_points_of_another_place_start_no_gaussians(project: Path) -> None:
+    model = read_model(project / "sparse/0")
+    here = Similarity(np.eye(3), np.zeros(3), 1.0)
+    assert model.rgb is not None
+    loose = LoosePoints(model.xyz, model.rgb)
+    assert in_scene(loose, here, model) is not None
+    assert in_scene(LoosePoints(model.xyz + np.array([0, 0, 50]), model.rgb), here, model) is None
+    assert in_scene(LoosePoints(1e-3 * model.xyz, model.rgb), here, model) is None, "in other units"
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])

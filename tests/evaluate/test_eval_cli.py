@@ -144,7 +144,7 @@ def test_metrics_that_are_not_installed(
 
 
 def test_one_figure_per_line(shell: Shell, run: Path, truth: Path) -> None:
-    """All figures beside the table were one line of 200 letters, which ended in "dB from black"."""
+    """All figures next to the table were one line of 200 letters, which ended in "dB from black"."""
     _, out, _ = shell(run, "--reference", truth, *FAST)
     _, _, after = out.partition("\nrivr:\n")
     lines = after.splitlines()

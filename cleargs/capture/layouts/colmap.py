@@ -51,6 +51,7 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """See `Layout.open_capture`. Images without a pose are frames too: the table has them, unregistered."""
+    from cleargs.capture.loose_points import LoosePoints
     from cleargs.capture.model import read_model
 
     models, folder = _models(source), _largest(source)
@@ -98,12 +99,16 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     if len(model.point_ids) and not seen:
         notes.append(
             f"no two images see one of the {len(model.point_ids)} points of the COLMAP model, as RealityScan "
-            "and laser scanners export it: points are triangulated from the images"
+            "and laser scanners export it: others are triangulated from the images"
         )
+    loose = None
+    if model.rgb is not None and len(model.rgb) and not seen:
+        loose = LoosePoints(model.xyz, model.rgb)
     sparse = model if seen or model.dropped else None
     told = listed_pictures(frames, source, f"the COLMAP model of {folder.relative_to(source)}/")
+    available = tuple(frames)
     return Capture(
-        "colmap", taken, len(frames), sparse, available=tuple(frames), told=told, notes=tuple(notes)
+        "colmap", taken, len(frames), sparse, loose, available=available, told=told, notes=tuple(notes)
     )
 
 

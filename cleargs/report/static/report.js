@@ -40,7 +40,7 @@ const part = (title, text, data = []) => {
 
 const decibels = (frame) => (frame.psnr === null ? "" : `PSNR ${frame.psnr.toFixed(1)} dB`);
 
-// How much the frame counts and why, then its role, a term of the paper.
+// The weight of the frame with its reason, then its PSNR and its role, a term of the paper.
 const facts = (frame) => {
   const role = frame.weight_text.includes(frame.role) ? "" : `role by RVA: ${frame.role}`;
   return [frame.weight_text || "not rated", decibels(frame), role].filter(Boolean);
