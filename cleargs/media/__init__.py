@@ -4,7 +4,7 @@ _IMAGES = ".jpg .jpeg .jpe .jfif .mpo .png .webp .tif .tiff .bmp .heic .heif .hi
 _VIDEOS = ".mp4 .mov .m4v .mkv .webm .avi .mts .m2ts .mpg .3gp"
 _OTHERS = (
     ".dng .cr2 .cr3 .nef .nrw .arw .sr2 .raf .orf .rw2 .rwl .pef .srw .gpr .x3f .3fr .iiq "
-    ".gif .psd .jp2 .ppm .pgm"
+    ".gif .psd .jp2 .ppm .pgm .hdr"
 )
 
 IMAGE_SUFFIXES = frozenset(_IMAGES.split())

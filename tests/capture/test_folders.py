@@ -457,9 +457,9 @@ def test_pictures_of_many_bands_alone_are_refused_by_name(tmp_path: Path) -> Non
 
 
 def test_raw_photographs_are_told(images: Path) -> None:
-    for name in ("a.DNG", "b.CR3", "c.psd"):
+    for name in ("a.DNG", "b.CR3", "c.hdr"):
         (images / name).write_bytes(b"II*\0")
-    assert "3 raw or other pictures (a.DNG, b.CR3, c.psd)" in open_capture(images, IngestConfig()).told
+    assert "3 raw or other pictures (a.DNG, b.CR3, c.hdr)" in open_capture(images, IngestConfig()).told
 
 
 def test_poses_in_a_folder_below_are_not_passed_over_in_silence(posed: Path) -> None:
