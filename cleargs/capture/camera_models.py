@@ -1,4 +1,4 @@
-"""The camera models that ClearGS reads, in one table. A new one is a row here, and in `SfmModel` if fitted."""
+"""The camera models that ClearGS reads, in one table. `SfmModel` repeats the names of fitted ones."""
 
 from __future__ import annotations
 
