@@ -8,10 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from cleargs.base_model import FrozenModel
-from cleargs.plugins import installed_version
 from cleargs.rivr.config import RepairConfig
 from cleargs.rivr.harm import HarmConfig
-from cleargs.scene.config import G0_END
+from cleargs.scene.config import G0_END, kernel_libraries
 from cleargs.splat.config import OFF, TrainConfig, steps_from_frames
 from cleargs.types import Device
 
@@ -30,11 +29,6 @@ REPAIR_LIBRARIES = (
     "pyarrow",
     "safetensors",
 )
-
-
-def kernel_libraries(device: Device, config: object) -> Mapping[str, str]:
-    """Return the versions of the other libraries of the kernels on ``device``."""
-    return {"triton": installed_version("triton")} if device == "cuda" else {}
 
 
 def other_libraries(device: Device, config: object) -> Mapping[str, str]:

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
-from cleargs.scene.config import G0Config
+from cleargs.scene.config import G0Config, kernel_libraries
 from cleargs.scene.folder import LOG, TRAINED
-
-from .config import kernel_libraries
 
 VERSION = 48
 CONFIG = G0Config

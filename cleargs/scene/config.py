@@ -1,15 +1,23 @@
-"""Settings of the first scene."""
+"""Settings of the first scene, and the libraries of its kernels."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from cleargs.plugins import installed_version
 from cleargs.splat.config import TrainConfig
+from cleargs.types import Device
 
 G0_END = 16 / 19
 """Position, from 0 to 1, in the schedule of all trainings: the end of G0."""
+
+
+def kernel_libraries(device: Device, config: object) -> Mapping[str, str]:
+    """Return the versions of the other libraries of the kernels on ``device``."""
+    return {"triton": installed_version("triton")} if device == "cuda" else {}
 
 
 class G0Config(TrainConfig):

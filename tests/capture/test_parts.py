@@ -405,9 +405,13 @@ def test_a_frame_name_may_be_a_number_or_a_time() -> None:
     assert IngestConfig(holdout="2024-05-01T12:30:01.jpg").holdout == "2024-05-01T12:30:01.jpg"
 
 
+def pictures_of(folder: Path) -> dict[str, Path]:
+    return {path.name: path for path in folder.glob("*.png")}
+
+
 def test_an_empty_folder_of_images_hides_no_other(images: Path) -> None:
     (images / "images").mkdir()
-    assert externals(images, IngestConfig()) == {"capture": images}
+    assert externals(images, IngestConfig()) == {"capture": pictures_of(images)}
     assert len(open_capture(images, IngestConfig()).frames) == len(list(images.glob("*.png")))
 
 
@@ -476,14 +480,14 @@ def test_externals_name_what_is_read(posed: Path, images: Path) -> None:
     config = IngestConfig()
     listed = {f"images/{index:03d}.png": posed / "images" / f"{index:03d}.png" for index in range(10)}
     assert externals(posed, config) == {"transforms": posed / "transforms.json", "images": listed}
-    assert externals(images, config) == {"capture": images}
+    assert externals(images, config) == {"capture": pictures_of(images)}
     assert externals(images / "view0.png", config) == {"capture": images / "view0.png"}
     (posed / "masks").mkdir()
     (posed / "notes").mkdir()
     assert externals(posed, config)["masks"] == posed / "masks"
     assert set(externals(posed, config)) == {"transforms", "images", "masks"}
     # The folder of images alone has the same masks next to it.
-    beside = {"capture": posed / "images", "masks": posed / "masks"}
+    beside = {"capture": pictures_of(posed / "images"), "masks": posed / "masks"}
     assert externals(posed / "images", config) == beside
 
 
