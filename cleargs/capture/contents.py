@@ -67,6 +67,7 @@ PREVIEWS, COPIES, OUTSIDE = (
     "picture%s outside images/",
 )
 BROKEN = "file%s that cannot be opened"
+EXR, EXR_SUFFIX = "EXR picture%s, depth or rendered layers", ".exr"
 OTHERS = "picture%s of captures with poses in folders below"
 SPOT = "picture%s of panoramas from one spot"
 DEEP_TIFF = "TIFF picture%s of one channel, depth or a spectral band"
@@ -180,6 +181,7 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     raw = [path for path in wanted if path.suffix.lower() in RAW_SUFFIXES]
     stems = {of_shot(path) for path in images}
     left_out[RAW] = [path for path in raw if of_shot(path) not in stems]
+    left_out[EXR] = [path for path in wanted if path.suffix.lower() == EXR_SUFFIX]
     left_out[UNREADABLE] = [path for path in images if lacks_package(path)]
     if len(left_out[UNREADABLE]) == len(images):  # reading the first one names the remedy
         left_out[UNREADABLE] = []
@@ -231,7 +233,7 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
 
 def media_files(root: Path) -> list[Path]:
     """Return pictures and videos below ``root``, without hidden ones and those of runs."""
-    suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
+    suffixes = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES | {EXR_SUFFIX}
     found = files_under(root, lambda folder: bool(SYSTEM.match(folder.name)))
     files = (path for path in found.values() if path.suffix.lower() in suffixes)
     return sorted(files, key=lambda path: (path.parent, path.name))

@@ -462,6 +462,14 @@ def test_raw_photographs_are_told(images: Path) -> None:
     assert "3 raw or other pictures (a.DNG, b.CR3, c.hdr)" in open_capture(images, IngestConfig()).told
 
 
+def test_exr_pictures_are_told(images: Path) -> None:
+    (images / "depth").mkdir()
+    for index in range(3):
+        (images / f"depth/{index}.exr").touch()
+    capture = open_capture(images, IngestConfig())
+    assert "left out: 3 EXR pictures, depth or rendered layers (depth/0.exr, " in capture.told
+
+
 def test_poses_in_a_folder_below_are_not_passed_over_in_silence(posed: Path) -> None:
     outer = posed.parent / "outer"
     outer.mkdir()
