@@ -148,8 +148,9 @@ class Runner(Planner):
         programs took the processor.
         """
         last = list(made.values())[-1]
-        wall, own = last.seconds + last.compile_seconds, last.cpu_seconds or 0.0
-        # Alone, a stage gets at least the time of one core.
+        # Alone, a stage gets at least the time of one core, except while it waits for another process that
+        # compiles kernels.
+        wall, own = last.seconds, last.cpu_seconds or 0.0
         busy = wall > BUSY * own and wall > STEADY_S
         pace = self.pace_of(made) if busy or len(made) > 1 else 1.0
         costs = [

@@ -22,6 +22,7 @@ from cleargs.pipeline.runner import Runner, check_same_input
 from cleargs.pipeline.stage import Estimate
 from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Store
+from cleargs.types import Device
 
 
 def stages_run(bench: Bench) -> list[str]:
@@ -287,6 +288,32 @@ def test_estimates_follow_what_stages_took(bench: Bench) -> None:
     first, after_count, after_square = expected(bench)
     assert (first, after_count) == ("estimate: about 6.4 min", "new estimate: about 3.3 min")
     assert after_square == "new estimate: about 9 s", "half of 18 s: the stages take no time here"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "compiling", "busy"), [(90.0, 0.0, True), (25.0, 90.0, False), (25.0, 0.0, False)]
+)
+def test_waiting_for_the_compiler_is_not_taken_for_other_programs(
+    bench: Bench, seconds: float, compiling: float, busy: bool
+) -> None:
+    made = {outcome.stage: outcome.manifest for outcome in bench.run(until="count")}
+    took = {"seconds": seconds, "compile_seconds": compiling, "cpu_seconds": 24.0}
+    made = {name: manifest.model_copy(update=took) for name, manifest in made.items()}
+    with DigestMemo(bench.store / "digests.json") as memo:
+        runner = Runner(bench.dag, bench.settings(), Store(bench.store, memo), 1, bench.remarks)
+        runner._revise(runner.plan()[1:], made, made)
+    assert ("other programs are busy" in bench.remarks.lines[-1]) == busy
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_kernels_of_the_stages_to_run_are_prepared_on_the_cpu(bench: Bench, device: Device) -> None:
+    prepared: list[list[str]] = []
+    dag = replace(bench.dag, prepare=lambda names: prepared.append([*names]))
+    for until in ("count", "square"):
+        run = replace(bench.settings(), device=device)
+        with DigestMemo(bench.store / "digests.json") as memo:
+            Runner(dag, run, Store(bench.store, memo), 1, bench.remarks).run_until(until)
+    assert prepared == ([["count"], ["square"]] if device == "cpu" else [])
 
 
 def test_stages_without_work_are_not_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
