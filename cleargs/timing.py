@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Self
 
 from cleargs.base_model import FrozenModel
 
@@ -29,13 +28,16 @@ class PartTime(FrozenModel):
 
 
 @dataclass
-class _Part:
+class Part:
+    """A part of the work, with the parts in it by name."""
+
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     times: int = 0
-    parts: dict[str, _Part] = field(default_factory=dict)
+    parts: dict[str, Part] = field(default_factory=dict)
 
     def rows(self, path: tuple[str, ...] = ()) -> Iterator[PartTime]:
+        """Yield the times of all parts in it, each before its own parts."""
         for name, part in self.parts.items():
             here = (*path, name)
             seconds, cpu = round(part.seconds, 3), round(part.cpu_seconds, 3)
@@ -43,52 +45,38 @@ class _Part:
             yield from part.rows(here)
 
 
-_current: ContextVar[_Part | None] = ContextVar("part", default=None)
+_current: ContextVar[Part | None] = ContextVar("part", default=None)
 
 
-class timed:  # noqa: N801  # a context manager
+@contextmanager
+def timed(name: str) -> Iterator[None]:
     """Count the time of a block as that of the part ``name`` of the block around it.
 
     It takes a few microseconds: the parts are those of a step, not of a pixel.
     """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __enter__(self) -> Self:
-        self._around = _current.get()
-        if self._around is not None:
-            self._part = self._around.parts.setdefault(self._name, _Part())
-            _current.set(self._part)
-            self._begun, self._cpu = time.perf_counter(), cpu_seconds()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._around is not None:
-            self._part.seconds += time.perf_counter() - self._begun
-            self._part.cpu_seconds += cpu_seconds() - self._cpu
-            self._part.times += 1
-            _current.set(self._around)
-
-
-class Record:
-    """The times of one recording."""
-
-    def __init__(self) -> None:
-        self._root = _Part()
-
-    def rows(self) -> tuple[PartTime, ...]:
-        """Return the times so far; each part comes before its own parts."""
-        return tuple(self._root.rows())
+    around = _current.get()
+    if around is None:
+        yield
+        return
+    part = around.parts.setdefault(name, Part())
+    _current.set(part)
+    begun, cpu = time.perf_counter(), cpu_seconds()
+    try:
+        yield
+    finally:
+        part.seconds += time.perf_counter() - begun
+        part.cpu_seconds += cpu_seconds() - cpu
+        part.times += 1
+        _current.set(around)
 
 
 @contextmanager
-def recorded() -> Iterator[Record]:
+def recorded() -> Iterator[Part]:
     """Record the times of this thread's parts until the block ends."""
-    record = Record()
-    token = _current.set(record._root)
+    whole = Part()
+    token = _current.set(whole)
     try:
-        yield record
+        yield whole
     finally:
         _current.reset(token)
 

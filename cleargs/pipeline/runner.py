@@ -244,7 +244,7 @@ class Runner(Planner):
             "compile_seconds": round(took.compiling, 3),
             "cpu_seconds": round(took.processor, 3),
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
-            "timing": times.rows(),
+            "timing": tuple(times.rows()),
         }
         now = self.external_digests(name)
         if now != {role: stage_key.origins[role] for role in now}:
