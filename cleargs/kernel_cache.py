@@ -10,10 +10,15 @@ from pathlib import Path
 
 
 def cache_folder(name: str) -> Path:
-    """Return a writable folder ``name`` for compiled kernels, creating it if necessary.
+    """Return a writable folder ``name`` for compiled kernels: `lasting_folder`, else a new temporary one."""
+    return lasting_folder(name) or Path(tempfile.mkdtemp(prefix=f"cleargs-{name}-"))
+
+
+def lasting_folder(name: str) -> Path | None:
+    """Return the folder ``name`` for compiled kernels that all processes share, creating it if necessary.
 
     It is in ``NUMBA_CACHE_DIR`` if that is set, else in the user's cache folder (``XDG_CACHE_HOME`` or
-    ``~/.cache``). If neither is writable, it is a new temporary folder.
+    ``~/.cache``). None if neither is writable.
     """
     own = f"{os.environ.get('XDG_CACHE_HOME') or '~/.cache'}/cleargs"
     for candidate in filter(None, (os.environ.get("NUMBA_CACHE_DIR"), own)):
@@ -23,7 +28,7 @@ def cache_folder(name: str) -> Path:
             folder.mkdir(mode=0o700, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
-    return Path(tempfile.mkdtemp(prefix=f"cleargs-{name}-"))
+    return None
 
 
 def installation() -> str:

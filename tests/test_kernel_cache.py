@@ -25,6 +25,8 @@ def test_cache_falls_back_to_a_temporary_folder(monkeypatch, tmp_path):
     folder = cache_folder("kernels")
     assert folder.parent == tmp_path
     assert folder.name.startswith("cleargs-kernels-")
+    monkeypatch.setattr(compilation.subprocess, "Popen", None)  # it is not called
+    compilation.begin()
 
 
 def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):

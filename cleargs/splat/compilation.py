@@ -12,6 +12,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
+from cleargs.kernel_cache import lasting_folder
 from cleargs.progress import COMPILING, Reporter
 from cleargs.splat.kernels.cpu.jit import compiled_mark, is_compiled
 from cleargs.subprocesses import module_command
@@ -20,8 +21,13 @@ _children: list[subprocess.Popen[bytes]] = []
 
 
 def begin() -> None:
-    """Start to compile the kernels of the CPU in a child process, unless this was done on this machine."""
-    if not is_compiled("cpu") and not any(child.poll() is None for child in _children):
+    """Start to compile the kernels of the CPU in a child process, unless this was done on this machine.
+
+    Without a lasting cache folder, this process would not find what another one compiled.
+    """
+    if lasting_folder("kernels") is None or is_compiled("cpu"):
+        return
+    if not any(child.poll() is None for child in _children):
         with suppress(OSError):  # `finish` compiles
             command = module_command("cleargs.splat.compilation")
             quiet = subprocess.DEVNULL
