@@ -198,10 +198,10 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     left_out[SPECTRAL] = [path for path, header in headers.items() if header and header.spectral]
     if left_out[SPECTRAL] and len(left_out[SPECTRAL]) == len(headers) and not videos:
         raise InputError(f"{root} has only {SPECTRAL % 's'}", hint=_HINTS[SPECTRAL])
+    headers = {path: headers[path] for path in _without([*headers], left_out[SPECTRAL])}
     for kind, names in ((SPOT, SPOT_NAME), (INFRARED, INFRARED_NAME)):
-        headers = {path: header for path, header in headers.items() if path not in set(left_out[SPECTRAL])}
         left_out[kind] = _by_name(names, headers, root)
-        headers = {path: header for path, header in headers.items() if path not in set(left_out[kind])}
+        headers = {path: headers[path] for path in _without([*headers], left_out[kind])}
     images, deep, left_out[GREY] = _by_channels(headers)
     left_out[DEEP_TIFF] = [path for path in deep if path.suffix.lower() in (".tif", ".tiff")]
     left_out[DEPTH] = _without(deep, left_out[DEEP_TIFF])
