@@ -487,8 +487,8 @@ def test_externals_name_what_is_read(posed: Path, images: Path) -> None:
     assert externals(posed, config)["masks"] == posed / "masks"
     assert set(externals(posed, config)) == {"transforms", "images", "masks"}
     # The folder of images alone has the same masks next to it.
-    beside = {"capture": pictures_of(posed / "images"), "masks": posed / "masks"}
-    assert externals(posed / "images", config) == beside
+    both = {"capture": pictures_of(posed / "images"), "masks": posed / "masks"}
+    assert externals(posed / "images", config) == both
 
 
 def test_exif_focal_length_is_the_starting_guess(tmp_path: Path) -> None:
