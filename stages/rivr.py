@@ -136,7 +136,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     if 2 * (refused := refused_repairs(rows)) > made:
         reporter.warn(
             f"{refused} of {made} repairs by {expert.name} were refused: they agree with neither the "
-            "raw frame nor the render (the report shows them); the renders replace them"
+            "frame image nor the render (the report shows them); the renders replace them"
         )
 
     repaired = any(row.accepted for row in rows)

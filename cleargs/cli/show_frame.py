@@ -64,7 +64,7 @@ LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; wid
 def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow) -> list[str]:
     """Write the layers of a frame side by side with labels, as a PNG. Return their names.
 
-    They are the raw frame, the layers of its latest round or image formation, and the last scene at its pose.
+    They are the frame image, layers of its latest round or image formation, and the last scene at its pose.
     """
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb

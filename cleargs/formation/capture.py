@@ -126,7 +126,7 @@ class CaptureFormation:
 
     @property
     def frames(self) -> dict[int, FrameFormation]:
-        """Formations of the raw frames, by frame_id."""
+        """Formations of the frames, by frame_id."""
         return dict(self._frames)
 
     @property
@@ -135,7 +135,7 @@ class CaptureFormation:
         return self._movement.masks()
 
     def weight(self, frame_id: int) -> float:
-        """Return the weight of a raw frame in the training: RVA's weight, or its trust if that is larger.
+        """Return the weight of a frame image in the training: RVA's weight, or its trust if that is larger.
 
             w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
 

@@ -1,4 +1,4 @@
-"""Comparison of a raw frame and a render under a motion, at one size.
+"""Comparison of a frame image and a render under a motion, at one size.
 
 The *misfit* is the mean difference of high-passed luminance in linear light. A quarter of the pixels, in
 blocks, is held out from every fit. The misfit on the held-out pixels decides which model explains the frame.
@@ -46,7 +46,7 @@ HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """A raw frame and the render that should explain it.
+    """A frame image and the render that should explain it.
 
     ``luminance``, ``depth`` and ``alpha`` of the render are larger than the frame by ``margin`` pixels on
     every side. ``camera`` is that of the frame.

@@ -61,7 +61,7 @@ softness of the render: sharp frames of rooms found 0.2 to 0.8 px, and the scene
 
 @dataclass(frozen=True)
 class Shot:
-    """A raw frame at the size of a training step, and the scene that it shows."""
+    """A frame image at the size of a training step, and the scene that it shows."""
 
     camera: Camera
     """The camera of the frame, reduced by ``factor``."""
@@ -110,7 +110,7 @@ def fit_motion(
     shot: Shot,
     terms: Terms,
 ) -> FrameFormation:
-    """Estimate how a raw frame was taken, from the scene that it shows.
+    """Estimate how a frame image was taken, from the scene that it shows.
 
     The known formation is refined, or the measured motion is followed. The frame is searched only for a
     `Reason`.

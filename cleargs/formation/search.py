@@ -1,4 +1,4 @@
-"""Search for the motion or the defocus under which the render looks like the raw frame.
+"""Search for the motion or the defocus under which the render looks like the frame image.
 
 Motions are found by Levenberg-Marquardt with Huber weights, discs of defocus by a pattern search, both from
 coarse to fine.

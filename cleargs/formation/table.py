@@ -79,7 +79,7 @@ FORMATION = pa.schema(
 
 
 def write_formation(path: Path, formation: CaptureFormation, weights: Mapping[int, float]) -> None:
-    """Write ``formation.parquet``. ``weights`` are RVA's weights of the raw frames, by frame_id."""
+    """Write ``formation.parquet``. ``weights`` are RVA's weights of the frames, by frame_id."""
     rows = [
         as_row(frame)
         | {

@@ -128,7 +128,7 @@ def formed_layers(
 
 
 def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
-    """Return layer -> image [H, W, 3] sRGB: the raw frame, its moving parts, and layers of the latest round.
+    """Return layer -> image [H, W, 3] sRGB: the frame image, its moving parts, layers of the latest round.
 
     Raises InputError if an image cannot be read, and StoreError for the file of the layers.
     """
@@ -173,7 +173,7 @@ def _write_frame(
 
 
 def _aligned_psnr(render: ImageU8, observed: ImageU8) -> float | None:
-    """Return the PSNR, dB, of a render against the raw frame, after the best affine change of its colours."""
+    """Return the PSNR, dB, of a render against the frame image, after the best affine change of colours."""
     height, width = render.shape[:2]
     reference = np.asarray(cv2.resize(observed, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     image, target = render / 255.0, reference / 255.0

@@ -1,4 +1,4 @@
-"""Distillation: training of the scene on raw frames and repairs together, and the check of its result."""
+"""Distillation: training of the scene on frame images and repairs together, and the check of its result."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def distil(
     repaired: float = 1.0,  # share of the frames that have a repair
     reporter: Reporter,
 ) -> SceneViewer:
-    """Continue the training on raw and repaired views, with Adam's moments; return the scene after it.
+    """Continue the training on frame images and repairs, with Adam's moments; return the scene after it.
 
     A finished training is read back. An interrupted one resumes from its checkpoint, which is deleted at the
     end.
 
-    ``even`` draws each repair as often as each raw frame. Otherwise a share of ``pseudo_share`` times
+    ``even`` draws each repair as often as each frame image. Otherwise a share of ``pseudo_share`` times
     ``repaired`` of the steps draws a repair: a few repairs must not be drawn as often as all frames together.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def fidelity(
     """Return the agreement of the scene with the control frames; None without any.
 
     Pixels that move do not count: those of the scene ``before``, to compare with, or else of this scene. For
-    PSNR, the render has the motion of the frame, since a sharp scene is not wrong because raw frames are
+    PSNR, the render has the motion of the frame, since a sharp scene is not wrong because frame images are
     blurred and skewed by the camera's motion.
     """
     values, scores = [], []
@@ -117,7 +117,7 @@ def check_harm(
 ) -> HarmCheck:
     """Compare ``trained`` with ``g0`` on the control frames.
 
-    Without ``repaired`` views the scene was trained on raw frames only, as G0 was. No repair can have done
+    Without ``repaired`` views the scene was trained on frame images only, as G0 was. No repair can have done
     harm then, so nothing is rendered or scored.
     """
     views = [supervision.views[frame_id] for frame_id in supervision.controls] if repaired else []

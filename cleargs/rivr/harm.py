@@ -35,7 +35,7 @@ class Fidelity(NamedTuple):
     """Agreement of a scene with the control frames: means over them."""
 
     psnr: float
-    """PSNR of a frame's render, with the frame's motion, against its raw observation, dB."""
+    """PSNR of a frame's render, with the frame's motion, against the frame image, dB."""
     score: float
     """Primary score of a render, 0-100, higher is better."""
 

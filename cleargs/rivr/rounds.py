@@ -53,7 +53,7 @@ class RepairContext:
     primary: Scorer
     tiebreak: Scorer
     cache: Path
-    """Folder for the restorations of raw frames, each of which is made when it is first needed."""
+    """Folder for the restorations of frame images, each of which is made when it is first needed."""
     threads: int
 
     def restored(
@@ -75,7 +75,7 @@ class RepairContext:
         return self.expert.restore(image, threads=self.threads)
 
     def _restored_observation(self, view: TrainingView) -> ImageF32:
-        """Return D_t of a raw frame from the cache: all rounds and resumed runs have the same bits."""
+        """Return D_t of a frame image from the cache: all rounds and resumed runs have the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
             return from_layer(read_exr(path).layers["restored"])
@@ -196,7 +196,7 @@ def read_row(out: Path, exr: str) -> Selection | None:
 def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView:
     """Return the chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
-    @cache  # a training loads a view often; the mask comes with the raw frame, which is then decoded once
+    @cache  # a training loads a view often; the mask comes with the frame image, which is then decoded once
     def mask() -> MaskBool | None:
         return target.load()[1]
 

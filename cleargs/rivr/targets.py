@@ -94,7 +94,7 @@ class Supervision:
 
     @property
     def real(self) -> list[TrainingView]:
-        """The active raw frames D_real, including the control frames, as for G0."""
+        """The active frame images D_real, including the control frames, as for G0."""
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property

@@ -32,7 +32,7 @@ from cleargs.types import ImageF32, MaskBool
 
 @dataclass(frozen=True, eq=False)
 class Deblurred:
-    """A raw frame without its motion or defocus."""
+    """A frame image without its motion or defocus."""
 
     image: ImageF32
     """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
@@ -42,7 +42,7 @@ class Deblurred:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """The training's explanation of a raw frame: the render after image formation."""
+    """The training's explanation of a frame: the render after image formation."""
 
     image: ImageF32
     """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
@@ -52,7 +52,7 @@ class Explained:
 
 
 def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
-    """Return the raw frame O_t [H, W, 3], float32 sRGB in [0, 1], and its mask [H, W] (None: all count)."""
+    """Return the frame image O_t [H, W, 3], float32 sRGB in [0, 1], and its mask [H, W] (None: all count)."""
     pixels, mask = view.load()
     return to_float32(pixels), mask
 
@@ -80,7 +80,7 @@ class SceneViewer:
         return image
 
     def observed(self, view: TrainingView) -> Tensor:
-        """Return the scene as the camera of a raw frame saw it, [H, W, 3] sRGB in [0, 1]."""
+        """Return the scene as the camera of a frame saw it, [H, W, 3] sRGB in [0, 1]."""
         formation = self.formations.get(view.frame_id)
         return render_observed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
@@ -103,14 +103,14 @@ class SceneViewer:
         return pixels if mask is None else pixels & mask
 
     def explained(self, view: TrainingView) -> Explained | None:
-        """Return the training's explanation of a raw frame; None without a model of the frame."""
+        """Return the training's explanation of a frame; None without a model of the frame."""
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return None
         return Explained(self.observed(view).numpy(), formation, self._weights[view.frame_id])
 
     def deblur(self, view: TrainingView) -> Deblurred | None:
-        """Return the raw frame without its motion or defocus; None if no model explains the frame.
+        """Return the frame image without its motion or defocus; None if no model explains the frame.
 
         If the training has estimated the formation of the frame, that is used. Otherwise it is estimated
         here.

@@ -47,11 +47,11 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
 
 
 class FormationConfig(FrozenModel):
-    """Settings of image formation, which is estimated per raw frame during the training."""
+    """Settings of image formation, which is estimated per frame during the training."""
 
     enabled: bool = Field(
         True,
-        description="compare each raw frame with the render after image formation: motion blur, rolling "
+        description="compare each frame image with the render after image formation: motion blur, rolling "
         "shutter, defocus",
     )
     start: float = Field(
@@ -190,7 +190,7 @@ class TrainConfig(FrozenModel):
         "degrees from the first step",
     )
 
-    formation: FormationConfig = Field(FormationConfig(), description="image formation of each raw frame")
+    formation: FormationConfig = Field(FormationConfig(), description="image formation of each frame")
 
     checkpoint_interval: int = Field(
         200,

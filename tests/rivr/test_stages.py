@@ -206,7 +206,7 @@ class Faithful:
 
 
 def keeping(**changes: Any) -> Any:
-    """Return the default settings: motion undone, no fusion, raw frames kept.
+    """Return the default settings: motion undone, no fusion, frame images kept.
 
     The stand-in scorers have no calibrated scale. The margin leaves the choice to them only where they differ
     much.
@@ -221,7 +221,7 @@ PLAIN = tiny_g0(formation={"enabled": False}, background=(0.0, 0.0, 0.0))
 def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It keeps its raw frame, the EXR shows how it is explained, and no repair of it is drawn."""
+    """It keeps its frame image, the EXR shows how it is explained, and no repair of it is drawn."""
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
     capture.use_good_scene()
     blurred = 2
@@ -287,7 +287,7 @@ def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pyte
 
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sharp frames are kept and supervise as raw frames alone; blurred ones get repairs."""
+    """Sharp frames are kept and supervise as frame images alone; blurred ones get repairs."""
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
     capture.use_good_scene()
     context = capture.context("rivr", keeping(), g0=PLAIN)
@@ -439,7 +439,7 @@ def test_without_rounds_the_first_scene_stays(capture: Capture) -> None:
 def test_a_round_in_which_nothing_is_taken_ends_the_rounds(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its training takes the steps of the rounds that are left, on the raw frames."""
+    """Its training takes the steps of the rounds that are left, on the frame images."""
     lines: list[str] = []
     monkeypatch.setattr(SilentReporter, "info", lambda reporter, text: lines.append(text))
     monkeypatch.setattr(rounds, "decide", lambda *args, **facts: decide(*args, **facts | {"masked": True}))
