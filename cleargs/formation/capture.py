@@ -29,11 +29,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
+from cleargs.formation.formed import FormedView
 from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
 from cleargs.formation.look import Shot, Terms, fit_motion
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import Movement
-from cleargs.formation.observed import FormedView
 from cleargs.formation.shutter import (
     MIN_TIMED_FRAMES,
     ROLLING,
@@ -155,7 +155,7 @@ class CaptureFormation:
         view: TrainingView,
         factor: float,
         progress: float,
-        target: Tensor,
+        observed: Tensor,
         mask: Tensor | None,
         render: Renderer,
     ) -> FormedView | None:
@@ -163,10 +163,10 @@ class CaptureFormation:
         frame_id, camera = view.frame_id, view.camera.scaled(factor)
         affines = self._affines
         affine = None if affines is None else affines.affine(frame_id)
-        own, mask = mask, self._movement.still(frame_id, mask, target)
+        own, mask = mask, self._movement.still(frame_id, mask, observed)
         weight, motion = view.weight, None
         if self._config.enabled and view.kind == "real":
-            shot = Shot(camera, affine, target, mask, render, factor)
+            shot = Shot(camera, affine, observed, mask, render, factor)
             if self._estimated(frame_id, progress, shot):
                 frame = self._frames[frame_id]
                 self._frames[frame_id] = replace(frame, draws=frame.draws + 1)
@@ -176,8 +176,8 @@ class CaptureFormation:
 
         def look(image: Tensor, rendered: Render, margin: int) -> Tensor | None:
             """Find what moves in the frame, and return the pixels that count."""
-            self._movement.look(frame_id, image, rendered, margin, target, own)
-            return self._movement.still(frame_id, own, target)
+            self._movement.look(frame_id, image, rendered, margin, observed, own)
+            return self._movement.still(frame_id, own, observed)
 
         looks = False
         if view.kind == "real" or frame_id not in self._frames:

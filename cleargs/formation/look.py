@@ -66,7 +66,7 @@ class Shot:
     camera: Camera
     """The camera of the frame, reduced by ``factor``."""
     affine: Tensor | None  # [3, 4] colour of the frame
-    target: Tensor  # [H, W, 3] sRGB
+    observed: Tensor  # [H, W, 3] sRGB
     mask: Tensor | None  # [H, W]
     render: Renderer
     """Renders the scene with depth."""
@@ -137,7 +137,7 @@ class _Look:
         """Render the scene with a margin."""
         shot, self._margin = self._shot, margin
         self._rendered = shot.render(widened(shot.camera, margin))
-        self._pair = frame_pair(self._rendered, shot.affine, shot.target, shot.mask, shot.camera, margin)
+        self._pair = frame_pair(self._rendered, shot.affine, shot.observed, shot.mask, shot.camera, margin)
 
     @property
     def _known(self) -> FrameMotion:
@@ -319,14 +319,19 @@ def _skew_gain(found: list[MotionFit]) -> float:
 
 
 def frame_pair(
-    rendered: Render, affine: Tensor | None, target: Tensor, mask: Tensor | None, camera: Camera, margin: int
+    rendered: Render,
+    affine: Tensor | None,
+    observed: Tensor,
+    mask: Tensor | None,
+    camera: Camera,
+    margin: int,
 ) -> FramePair:
     """Return the images that a search compares. Masked pixels of the frame show the render."""
     assert rendered.depth is not None
     image = rendered.image
     if affine is not None:
         image = backend_for(image.device).apply_affine(image, affine)
-    shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
+    shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), observed.cpu().numpy()
     counts = np.ones(seen.shape[:2], np.bool_) if mask is None else mask.cpu().numpy()
     inner = shown[margin : margin + camera.height, margin : margin + camera.width]
     return FramePair(

@@ -107,15 +107,15 @@ class Movement:
         image: Tensor,  # [H, W, 3] sRGB, the render as the frame's camera saw it
         render: Render,  # sharp, with depth
         margin: int,  # pixels by which ``render`` is larger on every side
-        target: Tensor,  # [H, W, 3] sRGB
+        observed: Tensor,  # [H, W, 3] sRGB
         mask: Tensor | None,  # [H, W] pixels that count by the user's mask
     ) -> None:
-        """Compare a frame, ``target``, with the scene, and update the cells that move in it."""
+        """Compare a frame, ``observed``, with the scene, and update the cells that move in it."""
         k, (height, width) = self._place[frame_id], image.shape[:2]
         assert render.depth is not None
         inner = slice(margin, margin + height), slice(margin, margin + width)
         counted = np.ones((height, width), np.float32) if mask is None else mask.float().cpu().numpy()
-        difference = (image - target).cpu().numpy() * counted[..., None]
+        difference = (image - observed).cpu().numpy() * counted[..., None]
         shares, alpha = self._pooled(counted), self._pooled(render.alpha[inner].cpu().numpy())
         known = (shares > 0.25) & (alpha > 0.5)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -138,10 +138,10 @@ class Movement:
         unwitnessed[asked] = witnesses < MIN_OTHERS
         self._moves[k] = regions(moves) | (self._moves[k] & unwitnessed)  # these stay as they were
 
-    def still(self, frame_id: int, mask: Tensor | None, target: Tensor) -> Tensor | None:
+    def still(self, frame_id: int, mask: Tensor | None, observed: Tensor) -> Tensor | None:
         """Return the pixels of a frame that count: see `counted`."""
         k = self._place.get(frame_id)
-        return counted(mask, None if k is None or not self._moves[k].any() else self._moves[k], target)
+        return counted(mask, None if k is None or not self._moves[k].any() else self._moves[k], observed)
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that the training changes, for a checkpoint."""
@@ -205,11 +205,11 @@ def regions(cells: MaskBool) -> MaskBool:  # [rows, columns]
     return np.asarray(cv2.dilate(large[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
-def counted(mask: Tensor | None, moves: MaskBool | None, target: Tensor) -> Tensor | None:
-    """Return the pixels [H, W] of ``mask`` in which nothing moves; None: all of ``target`` [H, W, 3]."""
+def counted(mask: Tensor | None, moves: MaskBool | None, observed: Tensor) -> Tensor | None:
+    """Return the pixels [H, W] of ``mask`` in which nothing moves; None: all of ``observed`` [H, W, 3]."""
     if moves is None:
         return mask
-    counts = torch.from_numpy(still_pixels(moves, target.shape[0], target.shape[1])).to(target.device)
+    counts = torch.from_numpy(still_pixels(moves, observed.shape[0], observed.shape[1])).to(observed.device)
     return counts if mask is None else counts & mask
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from cleargs.plugins import load_plugin
 from cleargs.types import ArrayF64, ImageF32
 
-Source: TypeAlias = Literal["observation", "deblurred", "render"]
+Source: TypeAlias = Literal["observed", "deblurred", "render"]
 """Image that the expert restored to D_t: O_t, O_t without the camera's motion, or R_t."""
 
 Scores: TypeAlias = Mapping[str, float]

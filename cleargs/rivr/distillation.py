@@ -18,7 +18,7 @@ from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, harm_of
 from cleargs.rivr.targets import Supervision
 from cleargs.scene.folder import SceneFolder
 from cleargs.scene.training import train_into
-from cleargs.scene.viewer import SceneViewer, observation
+from cleargs.scene.viewer import SceneViewer, observed_image
 from cleargs.splat.backend import psnr
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.views import TrainingView
@@ -97,10 +97,10 @@ def fidelity(
     """
     values, scores = [], []
     for view in controls:
-        render, (observed, mask) = scene.render(view), observation(view)
+        render, (observed, mask) = scene.render(view), observed_image(view)
         mask = (before or scene).still(view, mask)
         counted = None if mask is None else torch.from_numpy(mask)
-        values.append(psnr(scene.observed(view), torch.from_numpy(observed), counted))
+        values.append(psnr(scene.formed(view), torch.from_numpy(observed), counted))
         scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))
     return Fidelity(fmean(values), fmean(scores)) if controls else None
 

@@ -33,7 +33,7 @@ from cleargs.rivr.candidates import (
 from cleargs.rivr.config import RepairConfig
 from cleargs.rivr.gates import rejection_reason
 from cleargs.rivr.tables import Selection, chosen_counts
-from cleargs.scene.viewer import Deblurred, SceneViewer, observation
+from cleargs.scene.viewer import Deblurred, SceneViewer, observed_image
 from cleargs.splat.views import TrainingView
 from cleargs.types import ImageF32, MaskBool
 
@@ -68,20 +68,20 @@ class RepairContext:
             return self._restored(render), "render", None
         deblurred = scene.deblur(view) if self.config.undo_motion else None
         if deblurred is None:
-            return self._restored_observation(view), "observation", None
+            return self._restored_observed(view), "observed", None
         return self._restored(deblurred.image), "deblurred", deblurred
 
     def _restored(self, image: ImageF32) -> ImageF32:
         return self.expert.restore(image, threads=self.threads)
 
-    def _restored_observation(self, view: TrainingView) -> ImageF32:
+    def _restored_observed(self, view: TrainingView) -> ImageF32:
         """Return D_t of a frame image from the cache: all rounds and resumed runs have the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
             return from_layer(read_exr(path).layers["restored"])
         except StoreError:  # missing or incomplete
             self.cache.mkdir(exist_ok=True)
-            restored = to_layer(self._restored(observation(view)[0]))
+            restored = to_layer(self._restored(observed_image(view)[0]))
             write_exr(path, LayeredImage({"restored": restored}, {}))
             return from_layer(read_exr(path).layers["restored"])
 
@@ -129,7 +129,7 @@ def repair(
     rendered = scene.render(view)
     restored, source, deblurred = context.restored(view, rendered, scene)
     explained = scene.explained(view)
-    observed, mask = observation(view)
+    observed, mask = observed_image(view)
     mask = scene.still(view, mask)  # regions that move are not repaired
     layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
     config, threads = context.config, context.threads

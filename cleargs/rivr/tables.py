@@ -40,7 +40,7 @@ class Selection:
     ]
     tiebreak: Annotated[Scores, SCORES, f"{_SCORES} that decides near-ties"]
     restored_from: Annotated[
-        Source | None, "image that the expert restored to D_t: observation, deblurred or render"
+        Source | None, "image that the expert restored to D_t: observed, deblurred or render"
     ]
     blur_px: Annotated[float | None, pa.float32(), "mean way of the pixels while exposed, as undone"]
     skew_px: Annotated[float | None, pa.float32(), "their mean way from the first to the last row"]

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from cleargs.capture.folders import spread
 from cleargs.formation.deblur import deblur
+from cleargs.formation.formed import FormedView, render_formed
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.look import Shot, Terms, fit_motion
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import still_pixels
-from cleargs.formation.observed import FormedView, render_observed
 from cleargs.formation.shutter import rolls
 from cleargs.media.image import to_float32
 from cleargs.scene.folder import SceneFolder
@@ -51,7 +51,7 @@ class Explained:
     """The frame's weight at the end of the training: RVA's, or a higher one by its misfit."""
 
 
-def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
+def observed_image(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
     """Return the frame image O_t [H, W, 3], float32 sRGB in [0, 1], and its mask [H, W] (None: all count)."""
     pixels, mask = view.load()
     return to_float32(pixels), mask
@@ -76,13 +76,13 @@ class SceneViewer:
 
     def render(self, view: TrainingView) -> ImageF32:
         """Return R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
-        image: ImageF32 = render_observed(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
+        image: ImageF32 = render_formed(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
-    def observed(self, view: TrainingView) -> Tensor:
+    def formed(self, view: TrainingView) -> Tensor:
         """Return the scene as the camera of a frame saw it, [H, W, 3] sRGB in [0, 1]."""
         formation = self.formations.get(view.frame_id)
-        return render_observed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
+        return render_formed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
     def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
         """Return the PSNR, dB, of the pixels that no training saw; None if there are none.
@@ -107,7 +107,7 @@ class SceneViewer:
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return None
-        return Explained(self.observed(view).numpy(), formation, self._weights[view.frame_id])
+        return Explained(self.formed(view).numpy(), formation, self._weights[view.frame_id])
 
     def deblur(self, view: TrainingView) -> Deblurred | None:
         """Return the frame image without its motion or defocus; None if no model explains the frame.
@@ -115,7 +115,7 @@ class SceneViewer:
         If the training has estimated the formation of the frame, that is used. Otherwise it is estimated
         here.
         """
-        observed, mask = observation(view)
+        observed, mask = observed_image(view)
         affine = self._affine(view)
         found = self.formations.get(view.frame_id, FrameFormation(view.frame_id))
         if found.draws == 0:
@@ -149,7 +149,7 @@ class SceneViewer:
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return {}
-        observed, mask = observation(view)
+        observed, mask = observed_image(view)
         camera = view.camera.scaled(factor)
         if factor < 1.0:
             size = camera.width, camera.height

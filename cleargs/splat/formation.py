@@ -32,10 +32,10 @@ class Formed(Protocol):
     """Pixels [H, W] that count; None: all. After `forward`, those in which something moves are left out."""
 
     def forward(self, render: Render) -> Tensor:
-        """Return the observed image [H, W, 3] sRGB of a render."""
+        """Return the formed image [H, W, 3] sRGB of a render."""
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Return the gradient of the render's image, given that of the observed image [H, W, 3]."""
+        """Return the gradient of the render's image, given that of the formed image [H, W, 3]."""
 
     def learn(self) -> None:
         """Update the learned parameters, by the gradient of the last `backward`."""
@@ -49,7 +49,7 @@ class Formation(Protocol):
         view: TrainingView,
         factor: float,  # scale of the training image in this step
         progress: float,  # position in the schedule, 0 to 1
-        target: Tensor,  # [H, W, 3] sRGB at this scale
+        observed: Tensor,  # [H, W, 3] sRGB at this scale
         mask: Tensor | None,  # [H, W] pixels that count
         render: Renderer,  # renders the current scene
     ) -> Formed | None:

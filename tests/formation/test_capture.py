@@ -15,10 +15,10 @@ import torch
 from cleargs.formation.capture import SETTLED, CaptureFormation
 from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
+from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.movement import still_pixels
-from cleargs.formation.observed import render_observed
 from cleargs.formation.pretest import BlurEvidence
 from cleargs.formation.search import search
 from cleargs.formation.shutter import MIN_TESTED_FRAMES, CameraSpeeds
@@ -89,7 +89,7 @@ def views(
     for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
         view = TrainingView(index, camera(angle), 1.0, "real", lambda: (None, None))
         moved = FrameFormation(index, motion, "blur", reach_px=4.0) if index == blurred else None
-        seen = render_observed(scene(), view, formation=moved).numpy()
+        seen = render_formed(scene(), view, formation=moved).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         weight = 1.0 if weights is None else weights[index]
         made.append(TrainingView(index, view.camera, weight, "real", lambda pixels=pixels: (pixels, None)))
@@ -168,7 +168,7 @@ def test_a_common_drift_does_not_carry_the_reliable_frames_away(tmp_path: Path) 
     ]
     assert corrections == pytest.approx([2.0] * (FRAMES - 1), abs=0.4)
     sharp = views(None)[BLURRED]
-    error = render_observed(trained.scene, sharp) - torch.from_numpy(sharp.load()[0].astype(np.float32) / 255)
+    error = render_formed(trained.scene, sharp) - torch.from_numpy(sharp.load()[0].astype(np.float32) / 255)
     assert float(error.square().mean()) < 1e-3
 
 
@@ -179,7 +179,7 @@ def test_with_it_a_blurred_frame_teaches_a_sharp_scene(tmp_path: Path) -> None:
     truth = torch.from_numpy(sharp.load()[0].astype(np.float32) / 255)
     for name, formation in (("plain", None), ("formed", CaptureFormation([views()[BLURRED]], LOOK))):
         trained = run(tmp_path / name, [views()[BLURRED]], formation)
-        errors[name] = float((render_observed(trained.scene, sharp) - truth).square().mean())
+        errors[name] = float((render_formed(trained.scene, sharp) - truth).square().mean())
     assert errors["formed"] < 0.1 * errors["plain"]
 
 
@@ -385,7 +385,7 @@ def test_what_moves_teaches_little(tmp_path: Path) -> None:
         look = FormationConfig(start=0.0, enabled=motions)
         formation = CaptureFormation(crossed(), look, tolerance=tolerance)
         trained = run(tmp_path / name, crossed(), formation)
-        shown = [render_observed(trained.scene, view) - render_observed(scene(), view) for view in crossed()]
+        shown = [render_formed(trained.scene, view) - render_formed(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
     assert errors["doubted"] < 0.2 * errors["plain"], errors
     assert errors["alone"] < 0.2 * errors["plain"], errors
@@ -456,7 +456,7 @@ def skewed(frames: list[int]) -> list[TrainingView]:
     made = []
     for view in views(blurred=None):
         moved = FrameFormation(view.frame_id, SKEW, "skew", reach_px=5.0)
-        seen = render_observed(scene(), view, formation=moved if view.frame_id in frames else None).numpy()
+        seen = render_formed(scene(), view, formation=moved if view.frame_id in frames else None).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         made.append(
             TrainingView(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None))
@@ -468,11 +468,11 @@ def test_a_twist_is_the_motion_of_the_scene_past_the_camera() -> None:
     """The last rows of a skewed frame are those of a camera turned by half the skew."""
     view = views(blurred=None)[2]
     moved = FrameFormation(2, SKEW, "skew", reach_px=5.0)
-    seen = render_observed(scene(), view, formation=moved)[-4:, 8:-8]
+    seen = render_formed(scene(), view, formation=moved)[-4:, 8:-8]
     difference = {}
     for side in (-1, 1):
         turned = TrainingView(2, camera(side * 0.5 * 9.0 / 90.0), 1.0, "real", view.load)
-        difference[side] = float((render_observed(scene(), turned)[-4:, 8:-8] - seen).abs().mean())
+        difference[side] = float((render_formed(scene(), turned)[-4:, 8:-8] - seen).abs().mean())
     # The four rows lie up to a 0.3 px short of it, where the squares have edges.
     assert difference[1] < 0.4 * difference[-1], difference
 
@@ -588,7 +588,7 @@ def test_a_frame_is_rendered_with_a_margin() -> None:
     """Content that moved in from outside the border is explained too."""
     seen = views()
     moved = FrameFormation(BLURRED, BLUR, "blur", reach_px=4.0)
-    wide = render_observed(scene(), seen[BLURRED], formation=moved)
-    without = render_observed(scene(), seen[BLURRED], formation=FrameFormation(BLURRED, BLUR, "blur"))
+    wide = render_formed(scene(), seen[BLURRED], formation=moved)
+    without = render_formed(scene(), seen[BLURRED], formation=FrameFormation(BLURRED, BLUR, "blur"))
     assert (wide - without)[4:-4, 8:-8].abs().max() < 1e-5
     assert (wide - without)[:, :2].abs().max() > 0.01

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.observed import render_observed
 from cleargs.formation.warp import displacement_fields
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.views import TrainingView
@@ -37,7 +37,7 @@ def filmed(motions: dict[int, FrameFormation]) -> list[TrainingView]:
     made = []
     for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
         view = TrainingView(index, camera(angle), 1.0, "real", lambda: (None, None))
-        seen = render_observed(scene(), view, formation=motions.get(index)).numpy()
+        seen = render_formed(scene(), view, formation=motions.get(index)).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         made.append(TrainingView(index, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
     return made
@@ -90,8 +90,8 @@ def test_a_measured_skew_is_there_from_the_first_step(tmp_path: Path, columns: b
     with_skew = run(tmp_path / "skew", seen, formation)
     without = run(tmp_path / "plain", seen, None)
     for trained, low in ((with_skew, True), (without, False)):
-        shown = render_observed(trained.scene, filmed({})[0])
-        off = float((shown - render_observed(scene(), filmed({})[0])).abs().mean())
+        shown = render_formed(trained.scene, filmed({})[0])
+        off = float((shown - render_formed(scene(), filmed({})[0])).abs().mean())
         assert (off < 0.004) == low, off
 
 

@@ -46,12 +46,12 @@ def movement(apart: float = STEP, tolerance: float = 0.05) -> Movement:
 
 
 def look(
-    found: Movement, frame_id: int, target: Tensor, mask: Tensor | None = None, shown: Tensor | None = None
+    found: Movement, frame_id: int, observed: Tensor, mask: Tensor | None = None, shown: Tensor | None = None
 ) -> None:
     """Compare a frame with a wall that shows `picture`."""
     image = picture() if shown is None else shown
     alpha = torch.ones(HEIGHT, WIDTH)
-    found.look(frame_id, image, Render(image, alpha, DEPTH * alpha), 0, target, mask)
+    found.look(frame_id, image, Render(image, alpha, DEPTH * alpha), 0, observed, mask)
 
 
 def looked(targets: dict[int, Tensor], found: Movement | None = None) -> Movement:

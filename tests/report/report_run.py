@@ -243,7 +243,7 @@ class FinishedRun:
                     primary={"render": 80.0, "restored": 85.0 + index, "observed": 75.0},
                     tiebreak_metric="natural-1",
                     tiebreak={"render": 70.0, "restored": 71.0, "observed": 72.0},
-                    restored_from="observation",
+                    restored_from="observed",
                     blur_px=2.0 * index,
                     skew_px=0.3,
                     chosen="restored",

@@ -166,13 +166,13 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
     context = capture.context("rivr", tiny_rivr(undo_motion=True))
     rivr.run(context)
     rows = tried_rows(context)
-    sharp = {row.frame_id for row in rows if row.restored_from == "observation"}
+    sharp = {row.frame_id for row in rows if row.restored_from == "observed"}
     # Every round renders, and so deblurs, again; a frame that nothing explains is restored once as it is.
     assert expert.calls == sum(row.restored_from == "deblurred" for row in rows) + len(sharp)
     blur = dict.fromkeys(((n, k) for n in (1, 2) for k in TARGETS), 0.0)
     for row in rows:
         exr = read_exr(context.out / row.exr, "cleargs:")
-        if row.restored_from == "observation":
+        if row.restored_from == "observed":
             assert row.blur_px is None
             continue
         assert row.blur_px is not None

@@ -19,7 +19,7 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.observed import render_observed
+from cleargs.formation.formed import render_formed
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.scene.measure import ViewPsnr, evaluate_views, pooled_unseen
@@ -640,5 +640,5 @@ def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: P
     grey = [float((exposure.of(frame) @ [0.5, 0.5, 0.5, 1.0]).mean()) for frame in range(6)]
     # The true ratio of the halves is 0.8. The test asserts half of the way; noise would give about 1.
     assert np.mean(grey[3:]) / np.mean(grey[:3]) < 0.9
-    bright, dark = (render_observed(trained.scene, views(darker)[i], exposure) for i in (0, 3))
+    bright, dark = (render_formed(trained.scene, views(darker)[i], exposure) for i in (0, 3))
     assert bright.mean() > dark.mean()

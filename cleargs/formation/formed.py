@@ -1,4 +1,4 @@
-"""The observed image of a frame (its render after image formation) and its gradient."""
+"""The formed image of a frame (its render after image formation) and its gradient."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class FormedView:
     A rolling shutter is a part of the camera: each Gaussian is seen from the pose at which its row was read.
     With ``still``, the render is that of a still camera, and `warp` has the skew too, to undo it.
 
-    ``look`` receives each observed image with its render and margin, and returns the pixels that count: see
+    ``look`` receives each formed image with its render and margin, and returns the pixels that count: see
     `cleargs.formation.movement`.
     """
 
@@ -59,7 +59,7 @@ class FormedView:
         self.needs_depth = self._motion is not None or self.look is not None
 
     def forward(self, render: Render) -> Tensor:
-        """Return the observed image [H, W, 3] sRGB of a render at ``camera``."""
+        """Return the formed image [H, W, 3] sRGB of a render at ``camera``."""
         image, device = render.image, render.image.device
         backend = backend_for(device)
         if self.affine is not None:
@@ -82,7 +82,7 @@ class FormedView:
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Return the gradient by the render's image, from that by the observed image."""
+        """Return the gradient by the render's image, from that by the formed image."""
         backend = backend_for(gradient.device)
         if self._motion is not None:
             light = backend.times_slope(gradient, self._to_srgb, CHANNELS)
@@ -97,7 +97,7 @@ class FormedView:
             self.affines.step(self.frame_id, self._affine_gradient.cpu().numpy())
 
 
-def render_observed(
+def render_formed(
     scene: Scene,
     view: TrainingView,
     exposure: Exposure | None = None,
