@@ -120,7 +120,7 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any])
             model = EFFECTS[found["model"]][0]
             lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
             sizes = ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
-            yield "formation", f"{model}, explains {100 * found['explained']:.0f} % of the misfit; {sizes}"
+            yield "formation", f"{model}, explains {100 * found['explained']:.0f} % of the residual; {sizes}"
         before, after = found["weight_before"], found["weight_after"]
         yield "weight", f"{before:.2f} before image formation, {after:.2f} after it"
     for choice in row.rounds:

@@ -52,8 +52,8 @@ ROLLING_START = 0.1
 """Fraction of the schedule from which frames are tested for a rolling shutter. The scene gradually learns the
 skew of the frames. At places that few frames see, it hides their skew before `FormationConfig.start`
 (docs/experiments/formation.md)."""
-DOUBTED = 0.5
-"""RVA weight below which a frame is doubted: less blur is then enough for a search."""
+LOW_WEIGHT = 0.5
+"""RVA weight below which less blur is enough for a search."""
 AGAIN = 4
 """Number of looks from the first one to the next try of a higher order and, if the shutter rolls, to the next
 search. It doubles from one try to the next, because the scene changes less and less."""
@@ -70,14 +70,16 @@ SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
 had one. In a sharp capture a frame is searched at its first look only if the test finds blur."""
 
 
-def median_misfit(frames: Iterable[FrameFormation], weights: Mapping[int, float]) -> float:
-    """Return the median misfit (difference from the render), weighted by ``weights``; 0 if none is known."""
-    known = sorted((frame.misfit, weights.get(frame.frame_id, 0.0)) for frame in frames if frame.misfit > 0.0)
+def median_residual(frames: Iterable[FrameFormation], weights: Mapping[int, float]) -> float:
+    """Return the median residual of the frames, weighted by ``weights``; 0 if none is known."""
+    known = sorted(
+        (frame.residual, weights.get(frame.frame_id, 0.0)) for frame in frames if frame.residual > 0.0
+    )
     half, passed = 0.5 * math.fsum(weight for _, weight in known), 0.0
-    for misfit, weight in known:
+    for residual, weight in known:
         passed += weight
         if passed >= half:
-            return misfit
+            return residual
     return 0.0
 
 
@@ -137,17 +139,17 @@ class CaptureFormation:
     def weight(self, frame_id: int) -> float:
         """Return the weight of a frame image in the training: RVA's weight, or its trust if that is larger.
 
-            w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
+            w = max(w_RVA, trust),  trust = min(1, rho / residual)^p
 
-        rho is the median misfit of the frames, weighted by w_RVA, and p is `FormationConfig.trust`. A frame
+        rho is the median residual of the frames, weighted by w_RVA, and p is `FormationConfig.trust`. A frame
         that is explained as well as reliable frames counts like one of them, also if it needs no model: RVA
         can mistake a sharp photograph of soft things, such as fur, for a blurred one.
         """
         prior, frame = self._weights[frame_id], self._frames[frame_id]
-        if frame.misfit <= 0.0:  # not compared with the scene so far
+        if frame.residual <= 0.0:  # not compared with the scene so far
             return prior
-        reference = median_misfit(self._frames.values(), self._weights)
-        trust: float = min(1.0, reference / frame.misfit) ** self._config.trust
+        reference = median_residual(self._frames.values(), self._weights)
+        trust: float = min(1.0, reference / frame.residual) ** self._config.trust
         return max(prior, trust)
 
     def form(
@@ -217,10 +219,10 @@ class CaptureFormation:
         tested: Literal["tested", "still"] = "tested" if self._asks(frame_id) else "still"
         terms = Terms(
             pose=frame_id in self._posed,
-            doubted=self._weights[frame_id] < DOUBTED,
+            low_weight=self._weights[frame_id] < LOW_WEIGHT,
             shutter="rolls" if self._rolls(frame_id) else tested,
             curve=_searched_again(frame.draws // self._config.every),
-            sparing=not self._config.first_search or self._sharp(),
+            only_if_blur_found=not self._config.first_search or self._sharp(),
             exposure_s=self._exposure(frame_id),
             measured=self._measured.get(frame_id),
         )

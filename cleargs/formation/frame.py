@@ -22,7 +22,7 @@ MARGIN_SHARE = 0.25
 """Largest margin, as a share of the shorter side."""
 
 LENS = ("disc_px", "focus", "median_depth", "exposure_s")
-MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
+MEASURED = ("residual", "residual_without", "blur_px", "skew_px", "defocus_px", "reach_px")
 """Fields of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 
@@ -34,9 +34,9 @@ class FrameFormation:
     frame_id: int
     motion: FrameMotion = field(default_factory=FrameMotion)
     model: Model = "none"
-    misfit: float = 0.0
+    residual: float = 0.0
     """Mean difference of high-passed linear luminance that the model leaves, see `comparison.MotionFit`."""
-    misfit_still: float = 0.0
+    residual_without: float = 0.0
     blur_px: float = 0.0
     """Mean length of the pixels' paths during the exposure."""
     skew_px: float = 0.0
@@ -46,10 +46,10 @@ class FrameFormation:
     reach_px: float = 0.0
     """Largest displacement of a pixel's samples along an axis: the 95th percentile over the pixels."""
     skew_gain: float | None = None
-    """Share of the misfit that a rolling shutter explains beyond blur and defocus, by the last search that
+    """Share of the residual that a rolling shutter explains beyond blur and defocus, by the last search that
     tried one; None if none did."""
-    evidence: float = 0.0
-    """Least evidence of further blur since the last search."""
+    blur_gain: float = 0.0
+    """Least gain of a further blur (`pretest`) since the last search."""
     draws: int = 0
     """Training steps on the frame since the first estimate of its formation."""
 
@@ -60,8 +60,8 @@ class FrameFormation:
 
     @property
     def explained(self) -> float:
-        """Share of the misfit that the model removes."""
-        return explained_share(self.misfit, self.misfit_still)
+        """Share of the residual that the model removes."""
+        return explained_share(self.residual, self.residual_without)
 
 
 def filmed_as(motion: FrameMotion, frame_id: int = -1) -> FrameFormation:
@@ -98,7 +98,7 @@ def margin_for(reach: float, camera: Camera) -> int:
 def as_row(frame: FrameFormation) -> dict[str, Any]:
     """Return the numbers of the frame by their names in ``formation.parquet``."""
     motion = frame.motion
-    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws", "evidence")}
+    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws", "blur_gain")}
     for name in TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
     row |= {name: getattr(motion, name) for name in (*LENS, "columns")} | {"order": motion.order}
@@ -115,7 +115,7 @@ def from_row(row: Mapping[str, Any]) -> FrameFormation:
         row["frame_id"],
         FrameMotion(**lens, columns=bool(row.get("columns"))).with_vector(vector),
         row["model"],
-        evidence=row.get("evidence") or 0.0,
+        blur_gain=row.get("blur_gain") or 0.0,
         draws=row.get("draws") or 0,
         **{name: row[name] for name in (*MEASURED, "skew_gain")},
     )

@@ -44,7 +44,7 @@ NARROWING = (0.25, 0.12, 0.06)
 """Steps of the pattern search for a disc, as shares of its radius and of the range of nearness."""
 
 MODEL_PENALTY = 0.005
-"""Share of the misfit that each further motion must explain to be preferred to a simpler model."""
+"""Share of the residual that each further motion must explain to be preferred to a simpler model."""
 
 DAMPING, MORE_DAMPING = 1e-2, 6.0
 DAMPING_FLOOR = 1e-4
@@ -56,7 +56,7 @@ MAX_TRIES = 4
 MAX_ORDER = 3
 """Highest order of a path in time."""
 ORDER_PENALTY = 0.005
-"""Share of the misfit without any motion that each further order of the path must explain to be preferred."""
+"""Share of the residual without any motion that each further order of the path must explain."""
 
 BEND_SHARE = 0.01
 """Share of the difference that a path must explain at a size before a cubic path is tried at that size. Most
@@ -152,7 +152,7 @@ def corrected(pair: FramePair, motion: FrameMotion, measured: Measurement, *, po
     unknowns = np.hstack([np.eye(len(active))[:, :TWIST], to_speed]) if pose else to_speed
     total = measured.exposure**2 + measured.readout**2
     speed = (measured.exposure * motion.blur + measured.readout * motion.skew) / total
-    variance = (1.25 * level.evaluate("blur", motion).misfit) ** 2  # if errors are normal
+    variance = (1.25 * level.evaluate("blur", motion).residual) ** 2  # if errors are normal
     held = np.zeros((unknowns.shape[1], unknowns.shape[1]))
     held[-TWIST:, -TWIST:] = SHARED_PIXELS * variance * measured.precision
     before = np.concatenate([np.zeros(unknowns.shape[1] - TWIST), speed - measured.speed])
@@ -193,11 +193,11 @@ def refine(
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
-    """Return the fit with the least misfit, with penalties for further motions and orders of the path."""
+    """Return the fit with the least residual, with penalties for further motions and orders of the path."""
 
     def cost(fit: MotionFit) -> float:
-        model = fit.misfit * (1.0 + MODEL_PENALTY * _PARTS[fit.model])
-        return model + ORDER_PENALTY * fit.misfit_still * (fit.motion.order - 1)
+        model = fit.residual * (1.0 + MODEL_PENALTY * _PARTS[fit.model])
+        return model + ORDER_PENALTY * fit.residual_without * (fit.motion.order - 1)
 
     return min(found, key=cost)
 

@@ -24,7 +24,7 @@ from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64
 
 ROLLING = 0.015
-"""Share of the misfit that a rolling shutter must explain in addition to all else, in half of a capture's
+"""Share of the residual that a rolling shutter must explain in addition to all else, in half of a capture's
 frames. Source: measurements in docs/formation.md."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames

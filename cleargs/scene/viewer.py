@@ -48,7 +48,7 @@ class Explained:
     """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
     formation: FrameFormation
     weight: float
-    """The frame's weight at the end of the training: RVA's, or a higher one by its misfit."""
+    """The frame's weight at the end of the training: RVA's, or a higher one by its residual."""
 
 
 def observed_image(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
@@ -130,7 +130,7 @@ class SceneViewer:
                     self._with_depth,
                 ),
                 Terms(
-                    doubted=True,
+                    low_weight=True,
                     shutter="rolls" if rolls(self.formations.values()) else "still",
                     measured=self.motions.get(view.frame_id),
                 ),

@@ -81,9 +81,9 @@ class FormationConfig(FrozenModel):
         return ("on" if value else "off") if isinstance(value, bool) else value
 
     accept: ClassVar[float] = 0.02
-    """Share of the misfit (mean difference) that a model must explain (docs/experiments/formation.md)."""
+    """Share of the residual (mean difference) that a model must explain (docs/experiments/formation.md)."""
     trust: ClassVar[float] = 1.0
-    """Exponent p in the weight of an explained frame, max(w_RVA, min(1, median misfit / misfit)^p)."""
+    """Exponent p in the weight of an explained frame, max(w_RVA, min(1, median residual / residual)^p)."""
 
 
 class TrainConfig(FrozenModel):

@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from cleargs.formation.capture import SETTLED, CaptureFormation
-from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit
+from cleargs.formation.comparison import MIN_RESIDUAL, FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.movement import still_pixels
-from cleargs.formation.pretest import BlurEvidence
+from cleargs.formation.pretest import MissingBlur
 from cleargs.formation.search import search
 from cleargs.formation.shutter import MIN_TESTED_FRAMES, CameraSpeeds
 from cleargs.formation.table import read_formation, write_formation
@@ -267,8 +267,8 @@ def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
     tmp_path: Path, searched: list[FramePair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All frames have noise. The test is replaced by one that sees a blur of 7 px across in each."""
-    found = BlurEvidence(line_gain=0.2, line=49.0 / 12.0, angle=0.0, disc_gain=0.0, disc=0.0)
-    monkeypatch.setattr("cleargs.formation.look.blur_evidence", lambda *_: found)
+    found = MissingBlur(line_gain=0.2, line=49.0 / 12.0, angle=0.0, disc_gain=0.0, disc=0.0)
+    monkeypatch.setattr("cleargs.formation.look.missing_blur", lambda *_: found)
     rng = np.random.default_rng(0)
     seen = []
     for view in views():
@@ -277,7 +277,7 @@ def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
         seen.append(replace(view, load=lambda pixels=pixels: (pixels, None)))
     formation = CaptureFormation(seen, DRAFT, known=known())
     run(tmp_path, seen, formation)
-    assert formation.frames[0].misfit > MIN_MISFIT
+    assert formation.frames[0].residual > MIN_RESIDUAL
     assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
     assert len(searched) == 1
 
@@ -287,11 +287,11 @@ def test_blur_that_the_last_search_left_is_not_searched_again(
 ) -> None:
     """It explains most of the error of the frame, as it did after that search."""
     first = known()
-    first[BLURRED] = replace(first[BLURRED], evidence=1.0)
+    first[BLURRED] = replace(first[BLURRED], blur_gain=1.0)
     formation = CaptureFormation(views(), LOOK, known=first)
     run(tmp_path, views(), formation)
     assert not searched
-    assert 0.0 < formation.frames[BLURRED].evidence < 1.0  # the share that is left
+    assert 0.0 < formation.frames[BLURRED].blur_gain < 1.0  # the share that is left
 
 
 def test_what_is_known_is_not_searched_again(tmp_path: Path, searched: list[FramePair]) -> None:
@@ -381,13 +381,13 @@ def test_what_moves_teaches_little(tmp_path: Path) -> None:
     The first looks have no witnesses, so that a little is learned before the masks are there.
     """
     errors = {}
-    for name, tolerance, motions in (("plain", 0.0, True), ("doubted", 0.05, True), ("alone", 0.05, False)):
+    for name, tolerance, motions in (("plain", 0.0, True), ("masked", 0.05, True), ("alone", 0.05, False)):
         look = FormationConfig(start=0.0, enabled=motions)
         formation = CaptureFormation(crossed(), look, tolerance=tolerance)
         trained = run(tmp_path / name, crossed(), formation)
         shown = [render_formed(trained.scene, view) - render_formed(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
-    assert errors["doubted"] < 0.2 * errors["plain"], errors
+    assert errors["masked"] < 0.2 * errors["plain"], errors
     assert errors["alone"] < 0.2 * errors["plain"], errors
 
 
@@ -535,11 +535,11 @@ def test_after_each_round_of_looks_the_common_skew_is_asked_for(
 def test_trust_is_earned() -> None:
     seen = views(weights=[1.0, 1.0, 0.2, 1.0, 0.1])
     known = {
-        0: FrameFormation(0, misfit=0.010, misfit_still=0.010),
-        1: FrameFormation(1, misfit=0.012, misfit_still=0.012),
-        2: FrameFormation(2, BLUR, "blur", misfit=0.016, misfit_still=0.05),
-        3: FrameFormation(3, misfit=0.008, misfit_still=0.008),
-        4: FrameFormation(4, misfit=0.05, misfit_still=0.05),
+        0: FrameFormation(0, residual=0.010, residual_without=0.010),
+        1: FrameFormation(1, residual=0.012, residual_without=0.012),
+        2: FrameFormation(2, BLUR, "blur", residual=0.016, residual_without=0.05),
+        3: FrameFormation(3, residual=0.008, residual_without=0.008),
+        4: FrameFormation(4, residual=0.05, residual_without=0.05),
     }
     formation = CaptureFormation(seen, LOOK, known=known)
     assert [formation.weight(k) for k in (0, 1, 3)] == [1.0, 1.0, 1.0]
@@ -549,9 +549,9 @@ def test_trust_is_earned() -> None:
     assert CaptureFormation(seen, LOOK).weight(4) == 0.1  # not compared with the scene so far: RVA's
 
 
-def test_a_frame_without_a_fault_earns_trust_by_its_misfit() -> None:
+def test_a_frame_without_a_fault_earns_trust_by_its_residual() -> None:
     """RVA gave soft close-ups of fur a tenth of the weight, and views near them lost 3 dB."""
-    known = {k: FrameFormation(k, misfit=0.010, misfit_still=0.010, draws=1) for k in range(FRAMES)}
+    known = {k: FrameFormation(k, residual=0.010, residual_without=0.010, draws=1) for k in range(FRAMES)}
     seen = views(weights=[1.0, 1.0, 1.0, 1.0, 0.12])
     formation = CaptureFormation(seen, LOOK, known=known)
     assert formation.weight(4) == 1.0

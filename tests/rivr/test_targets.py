@@ -35,13 +35,16 @@ def test_all_takes_every_frame_but_the_held_back() -> None:
     assert frames_to_repair("all", supervision(), {}) == [10, 11, 12, 14, 15]
 
 
-def found(**misfits: float) -> dict[int, FrameFormation]:
-    """Formations of frames ``f10``, ``f11``, ... with these misfits, of which none has a model."""
-    return {int(name[1:]): FrameFormation(int(name[1:]), misfit=misfit) for name, misfit in misfits.items()}
+def found(**residuals: float) -> dict[int, FrameFormation]:
+    """Formations of frames ``f10``, ``f11``, ... with these residuals, of which none has a model."""
+    return {
+        int(name[1:]): FrameFormation(int(name[1:]), residual=residual)
+        for name, residual in residuals.items()
+    }
 
 
 def test_auto_takes_what_formation_and_rva_leave_in_need() -> None:
-    """Frame 12 is suppressed, 14 reactivated without a model, 11 has three times the median misfit."""
+    """Frame 12 is suppressed, 14 reactivated without a model, 11 has three times the median residual."""
     formations = found(f10=0.01, f11=0.03, f13=0.01, f14=0.01, f15=0.01)
     assert frames_to_repair("auto", supervision(), formations) == [11, 12, 14]
     formations[14] = replace(formations[14], model="blur", blur_px=5.0)
