@@ -50,7 +50,7 @@ class FrameFormation:
     tried one; None if none did."""
     blur_gain: float = 0.0
     """Least gain of a further blur (`pretest`) since the last search."""
-    draws: int = 0
+    steps: int = 0
     """Training steps on the frame since the first estimate of its formation."""
 
     @property
@@ -98,7 +98,7 @@ def margin_for(reach: float, camera: Camera) -> int:
 def as_row(frame: FrameFormation) -> dict[str, Any]:
     """Return the numbers of the frame by their names in ``formation.parquet``."""
     motion = frame.motion
-    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws", "blur_gain")}
+    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "steps", "blur_gain")}
     for name in TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
     row |= {name: getattr(motion, name) for name in (*LENS, "columns")} | {"order": motion.order}
@@ -116,7 +116,7 @@ def from_row(row: Mapping[str, Any]) -> FrameFormation:
         FrameMotion(**lens, columns=bool(row.get("columns"))).with_vector(vector),
         row["model"],
         blur_gain=row.get("blur_gain") or 0.0,
-        draws=row.get("draws") or 0,
+        steps=row.get("steps") or 0,
         **{name: row[name] for name in (*MEASURED, "skew_gain")},
     )
 
@@ -136,5 +136,5 @@ def unpacked(numbers: NDArray[np.float64]) -> Iterator[FrameFormation]:
     names = tuple(as_row(FrameFormation(0)))
     for row in (dict(zip(names, values, strict=True)) for values in numbers.tolist()):
         gain = None if row["skew_gain"] < 0.0 else row["skew_gain"]
-        counts = {name: int(row[name]) for name in ("frame_id", "draws")}
+        counts = {name: int(row[name]) for name in ("frame_id", "steps")}
         yield from_row(row | counts | {"model": MODELS[int(row["model"])], "skew_gain": gain})

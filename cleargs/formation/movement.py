@@ -51,7 +51,7 @@ differs from the render."""
 MIN_CELLS = 6
 """Fewest cells of a region that moves."""
 EVERY = 3
-"""Steps on a frame between two looks (comparisons that update the cells that move)."""
+"""Steps on a frame between two checks (comparisons that update the cells that move)."""
 START = 0.25
 """Share of the schedule from which movement is looked for."""
 
@@ -93,15 +93,15 @@ class Movement:
             [(c.fx / c.width, c.fy / c.height, c.cx / c.width, c.cy / c.height) for c in self._cameras]
         ).reshape(-1, 4)
 
-    def due(self, draws: int, progress: float) -> bool:
-        """Return True if a step on a frame, after ``draws`` earlier ones, includes a look."""
-        return self._tolerance > 0.0 and progress >= START and draws % EVERY == 0
+    def due(self, visits: int, progress: float) -> bool:
+        """Return True if a step on a frame, after ``visits`` earlier ones, includes a check."""
+        return self._tolerance > 0.0 and progress >= START and visits % EVERY == 0
 
     def masks(self) -> dict[int, MaskBool]:
         """Return the cells that move [rows, columns], by frame_id, for frames in which something moves."""
         return {frame_id: self._moves[k] for frame_id, k in self._place.items() if self._moves[k].any()}
 
-    def look(
+    def check(
         self,
         frame_id: int,
         image: Tensor,  # [H, W, 3] sRGB, the render as the frame's camera saw it
@@ -138,7 +138,7 @@ class Movement:
         unwitnessed[asked] = witnesses < MIN_OTHERS
         self._moves[k] = regions(moves) | (self._moves[k] & unwitnessed)  # these stay as they were
 
-    def still(self, frame_id: int, mask: Tensor | None, observed: Tensor) -> Tensor | None:
+    def static_mask(self, frame_id: int, mask: Tensor | None, observed: Tensor) -> Tensor | None:
         """Return the pixels of a frame that count: see `counted`."""
         k = self._place.get(frame_id)
         return counted(mask, None if k is None or not self._moves[k].any() else self._moves[k], observed)
@@ -166,8 +166,8 @@ class Movement:
         """Return the differences of other frames at the places that C cells of frame ``k`` show at ``depth``.
 
         These are three arrays [C]: the median of the differences, infinite if no other frame sees the place;
-        the number of frames that see it and had a look; and the share of the `NEAR_FRAMES` of these with the
-        nearest cameras in which it moves.
+        the number of checked frames that see it; and the share of the `NEAR_FRAMES` of these with the nearest
+        cameras in which it moves.
         """
         rows, columns = self._moves.shape[1:]
         fx, fy, cx, cy = self._lenses[k]
@@ -209,11 +209,11 @@ def counted(mask: Tensor | None, moves: MaskBool | None, observed: Tensor) -> Te
     """Return the pixels [H, W] of ``mask`` in which nothing moves; None: all of ``observed`` [H, W, 3]."""
     if moves is None:
         return mask
-    counts = torch.from_numpy(still_pixels(moves, observed.shape[0], observed.shape[1])).to(observed.device)
+    counts = torch.from_numpy(static_pixels(moves, observed.shape[0], observed.shape[1])).to(observed.device)
     return counts if mask is None else counts & mask
 
 
-def still_pixels(moves: MaskBool, height: int, width: int) -> MaskBool:
+def static_pixels(moves: MaskBool, height: int, width: int) -> MaskBool:
     """Return the pixels [height, width] that are in no cell of ``moves`` [rows, columns]."""
     rows = np.arange(height) * moves.shape[0] // height
     columns = np.arange(width) * moves.shape[1] // width

@@ -38,7 +38,7 @@ MIN_TILE = 4
 MIN_VARIANCE = 0.05
 """Variance below which a blur does not count, px^2: that of a sweep of 0.8 px."""
 
-_STILL, _ALL = 4, 7
+_SHARP, _ALL = 4, 7
 """Number of parameters without a blur, and of all parameters."""
 _RIDGE = 1e-9
 
@@ -117,14 +117,14 @@ def _fitted(
         errors = [float(x @ unseen @ x) for (_, unseen), x in zip(halves, left, strict=True)]
         return math.fsum(errors), np.mean(numbers, axis=0)
 
-    still = np.eye(_ALL)[:, :_STILL]
-    none = fit(still)[0]
+    sharp = np.eye(_ALL)[:, :_SHARP]
+    none = fit(sharp)[0]
     if none <= 0.0:
         return NONE_MISSING
-    sxx, sxy, syy = fit(np.eye(_ALL))[1][_STILL:]
+    sxx, sxy, syy = fit(np.eye(_ALL))[1][_SHARP:]
     x, y = np.linalg.eigh([[sxx, sxy], [sxy, syy]])[1][:, 1]
     (line, along), (disc, round_) = (
-        fit(np.column_stack([still, [0.0, 0.0, 0.0, 0.0, *moments]]))
+        fit(np.column_stack([sharp, [0.0, 0.0, 0.0, 0.0, *moments]]))
         for moments in ((x * x, x * y, y * y), (1.0, 0.0, 1.0))
     )
     return MissingBlur(

@@ -1,10 +1,10 @@
 """Detection of a rolling shutter in a capture, and the skew that all its frames have in common.
 
 A scene can absorb a skew that all frames share: a walk around a table with a rolling shutter looks like one
-with a still shutter around a table that is twisted about its axis. The poses distinguish the two. The readout
-takes the same time in every frame, so a frame's skew is that time multiplied by the speed of the camera at
-the frame, plus the hand's tremor. Skew and speed vary from frame to frame. The slope of the skew over the
-speed is the readout time. The mean skew is the readout time multiplied by the mean speed.
+with a global shutter around a table that is twisted about its axis. The poses distinguish the two. The
+readout takes the same time in every frame, so a frame's skew is that time multiplied by the speed of the
+camera at the frame, plus the hand's tremor. Skew and speed vary from frame to frame. The slope of the skew
+over the speed is the readout time. The mean skew is the readout time multiplied by the mean speed.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ def _component(name: str, axis: str) -> pa.Field:
 FORMATION = pa.schema(
     [
         column("frame_id", pa.int32(), "active frame"),
-        column("draws", pa.int64(), "steps since the first estimate of the formation", nullable=True),
+        column("steps", pa.int64(), "steps since the first estimate of the formation", nullable=True),
         column("model", pa.string(), "none, blur, skew, both (blur and skew) or defocus"),
         column("order", pa.int32(), "order of the path: 1 straight, 2 quadratic, 3 cubic", nullable=True),
         column("blur_px", pa.float64(), "mean length of the pixels' paths during the exposure, px"),

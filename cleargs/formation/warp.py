@@ -1,4 +1,4 @@
-"""The linear operator B of a frame, from a still image to its photograph in linear light, and Bᵀ."""
+"""The linear operator B of a frame, from a sharp image to the frame image in linear light, and Bᵀ."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.metrics import psnr as psnr_of
 from cleargs.formation.frame import from_row
 from cleargs.formation.motion import pixel_paths
-from cleargs.formation.movement import still_pixels
+from cleargs.formation.movement import static_pixels
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_mask, read_rgb, reduced, to_uint8
 from cleargs.report.frames import HELD_OUT, FrameRow
@@ -137,7 +137,7 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     if row.frame.mask and not (used := read_mask(run / "ingest" / row.frame.mask) > 0).all():
         images["masked"] = _tinted(observed, used)
     if row.moving is not None:
-        images["moving"] = _tinted(observed, still_pixels(row.moving, *observed.shape[:2]))
+        images["moving"] = _tinted(observed, static_pixels(row.moving, *observed.shape[:2]))
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}

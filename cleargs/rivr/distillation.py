@@ -98,7 +98,7 @@ def fidelity(
     values, scores = [], []
     for view in controls:
         render, (observed, mask) = scene.render(view), observed_image(view)
-        mask = (before or scene).still(view, mask)
+        mask = (before or scene).static_mask(view, mask)
         counted = None if mask is None else torch.from_numpy(mask)
         values.append(psnr(scene.formed(view), torch.from_numpy(observed), counted))
         scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))

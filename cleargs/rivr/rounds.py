@@ -130,7 +130,7 @@ def repair(
     restored, source, deblurred = context.restored(view, rendered, scene)
     explained = scene.explained(view)
     observed, mask = observed_image(view)
-    mask = scene.still(view, mask)  # regions that move are not repaired
+    mask = scene.static_mask(view, mask)  # regions that move are not repaired
     layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
     config, threads = context.config, context.threads
     stored = (from_layer(layers["render"]), from_layer(layers["restored"]))

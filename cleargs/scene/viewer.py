@@ -13,11 +13,11 @@ from torch import Tensor
 
 from cleargs.capture.folders import spread
 from cleargs.formation.deblur import deblur
+from cleargs.formation.estimate import Shot, Terms, fit_motion
 from cleargs.formation.formed import FormedView, render_formed
 from cleargs.formation.frame import FrameFormation
-from cleargs.formation.look import Shot, Terms, fit_motion
 from cleargs.formation.measured import MeasuredPath
-from cleargs.formation.movement import still_pixels
+from cleargs.formation.movement import static_pixels
 from cleargs.formation.shutter import rolls
 from cleargs.media.image import to_float32
 from cleargs.scene.folder import SceneFolder
@@ -95,11 +95,11 @@ class SceneViewer:
         )
         return pooled_unseen(fits)
 
-    def still(self, view: TrainingView, mask: MaskBool | None) -> MaskBool | None:
+    def static_mask(self, view: TrainingView, mask: MaskBool | None) -> MaskBool | None:
         """Return ``mask`` without the pixels in which something moves; None: all pixels count."""
         if view.frame_id not in self.moving:
             return mask
-        pixels = still_pixels(self.moving[view.frame_id], view.camera.height, view.camera.width)
+        pixels = static_pixels(self.moving[view.frame_id], view.camera.height, view.camera.width)
         return pixels if mask is None else pixels & mask
 
     def explained(self, view: TrainingView) -> Explained | None:
@@ -118,7 +118,7 @@ class SceneViewer:
         observed, mask = observed_image(view)
         affine = self._affine(view)
         found = self.formations.get(view.frame_id, FrameFormation(view.frame_id))
-        if found.draws == 0:
+        if found.steps == 0:
             found = fit_motion(
                 found,
                 FormationConfig(),
@@ -131,13 +131,13 @@ class SceneViewer:
                 ),
                 Terms(
                     low_weight=True,
-                    shutter="rolls" if rolls(self.formations.values()) else "still",
+                    shutter="rolling" if rolls(self.formations.values()) else "global",
                     measured=self.motions.get(view.frame_id),
                 ),
             )
         if found.model == "none":
             return None
-        formed = FormedView(view.camera, 1.0, affine=affine, formation=found, still=True)
+        formed = FormedView(view.camera, 1.0, affine=affine, formation=found, global_shutter=True)
         return Deblurred(_deblurred(formed, self._with_depth(formed.camera), observed, mask), found)
 
     def formed_layers(self, view: TrainingView, factor: float = 1.0) -> dict[str, ImageF32]:
@@ -158,9 +158,14 @@ class SceneViewer:
                 mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         seen, formed = (
             FormedView(
-                camera, 1.0, affine=self._affine(view), formation=formation, factor=factor, still=still
+                camera,
+                1.0,
+                affine=self._affine(view),
+                formation=formation,
+                factor=factor,
+                global_shutter=stopped,
             )
-            for still in (False, True)
+            for stopped in (False, True)
         )
         render = self._with_depth(seen.camera)
         explained = seen.forward(render).clamp(0.0, 1.0).cpu().numpy()

@@ -197,17 +197,20 @@ class Trainer:
             target, mask = self._cache.get(view, factor)
         alpha = self._cache.alpha
         colour = random_grey(self._seed, schedule_step) if config.background is None else None
-        formed, looks = None, _Looks(partial(self._render, depth=True), colour, self._scene.background)
+        formed, renders = (
+            None,
+            _StepRenders(partial(self._render, depth=True), colour, self._scene.background),
+        )
         if self._formation is not None:
             progress = schedule_step / config.planned
             opaque = mask if alpha is None else _both(mask, alpha > 0.5)
             with timed("search for the formation"):
-                formed = self._formation.form(view, factor, progress, target, opaque, looks.render)
+                formed = self._formation.form(view, factor, progress, target, opaque, renders.render)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
         depth = formed is not None and formed.needs_depth
-        render = looks.last_of(camera) or self._render(camera, depth=depth, background=colour)
+        render = renders.last_of(camera) or self._render(camera, depth=depth, background=colour)
         with timed("image formation"):
             image = render.image if formed is None else formed.forward(render)
         if alpha is None:
@@ -392,7 +395,7 @@ class Trainer:
         )
 
 
-class _Looks:
+class _StepRenders:
     """Renders for image formation within one step. The step reuses the last one if the camera is the same."""
 
     def __init__(self, render: Callable[..., Render], colour: Colour | None, background: Colour) -> None:

@@ -12,13 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from cleargs.formation.capture import SETTLED, CaptureFormation
+from cleargs.formation.capture import ESTIMATES_TO_KEEP, CaptureFormation
 from cleargs.formation.comparison import MIN_RESIDUAL, FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.movement import still_pixels
+from cleargs.formation.movement import static_pixels
 from cleargs.formation.pretest import MissingBlur
 from cleargs.formation.search import search
 from cleargs.formation.shutter import MIN_TESTED_FRAMES, CameraSpeeds
@@ -202,7 +202,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> list[FramePair]:
         pairs.append(pair)
         return search(pair, **settings)
 
-    monkeypatch.setattr("cleargs.formation.look.search", counted)
+    monkeypatch.setattr("cleargs.formation.estimate.search", counted)
     return pairs
 
 
@@ -214,10 +214,10 @@ NO_TEST = 0.001
 
 def known(**blurs: FrameMotion) -> dict[int, FrameFormation]:
     """Return what an earlier training found: ``f2=BLUR``."""
-    still = {k: FrameFormation(k, skew_gain=NO_TEST, draws=LOOK.every) for k in range(FRAMES)}
+    still = {k: FrameFormation(k, skew_gain=NO_TEST, steps=LOOK.every) for k in range(FRAMES)}
     moved = {int(name[1:]): motion for name, motion in blurs.items()}
     return still | {
-        k: FrameFormation(k, motion, "blur", blur_px=7.0, reach_px=4.0, skew_gain=NO_TEST, draws=LOOK.every)
+        k: FrameFormation(k, motion, "blur", blur_px=7.0, reach_px=4.0, skew_gain=NO_TEST, steps=LOOK.every)
         for k, motion in moved.items()
     }
 
@@ -246,8 +246,8 @@ def test_a_sharp_capture_is_searched_only_where_there_is_evidence(
     monkeypatch.setattr("cleargs.formation.capture.MIN_SEARCHED_FRAMES", 4)
     monkeypatch.setattr("cleargs.formation.capture.SHARP_SHARE", 1 / 4)
     looked = known(**{f"f{k}": FrameMotion(blur=np.zeros(6)) for k in range(4, 4 + modelled)})
-    draws = {k: 0 if k in (0, BLURRED) else LOOK.every + 1 for k in looked}  # their next look is later
-    first = {k: replace(frame, draws=draws[k]) for k, frame in looked.items()}
+    steps = {k: 0 if k in (0, BLURRED) else LOOK.every + 1 for k in looked}  # their next look is later
+    first = {k: replace(frame, steps=steps[k]) for k, frame in looked.items()}
     formation = CaptureFormation(views(), LOOK, known=first)
     run(tmp_path, views(), formation)
     assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
@@ -259,7 +259,7 @@ def test_later_only_a_frame_with_evidence_is_searched(tmp_path: Path, searched: 
     formation = CaptureFormation(views(), LOOK, known=known())
     run(tmp_path, views(), formation)
     assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
-    assert formation.frames[BLURRED].draws > 2 * LOOK.every
+    assert formation.frames[BLURRED].steps > 2 * LOOK.every
     assert len(searched) == 1
 
 
@@ -268,7 +268,7 @@ def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
 ) -> None:
     """All frames have noise. The test is replaced by one that sees a blur of 7 px across in each."""
     found = MissingBlur(line_gain=0.2, line=49.0 / 12.0, angle=0.0, disc_gain=0.0, disc=0.0)
-    monkeypatch.setattr("cleargs.formation.look.missing_blur", lambda *_: found)
+    monkeypatch.setattr("cleargs.formation.estimate.missing_blur", lambda *_: found)
     rng = np.random.default_rng(0)
     seen = []
     for view in views():
@@ -324,12 +324,15 @@ def test_a_later_training_keeps_what_was_looked_at_often(
         return frame
 
     monkeypatch.setattr("cleargs.formation.capture.fit_motion", look)
-    often = {k: replace(frame, draws=(SETTLED - 1) * LOOK.every + 1) for k, frame in known(f2=BLUR).items()}
-    often[0] = replace(often[0], draws=(SETTLED - 1) * LOOK.every)
+    often = {
+        k: replace(frame, steps=(ESTIMATES_TO_KEEP - 1) * LOOK.every + 1)
+        for k, frame in known(f2=BLUR).items()
+    }
+    often[0] = replace(often[0], steps=(ESTIMATES_TO_KEEP - 1) * LOOK.every)
     formation = CaptureFormation(views(), LOOK, known=often)
     run(tmp_path, views(), formation)
     assert set(looked) == {0}
-    assert formation.frames[BLURRED].draws > often[BLURRED].draws  # its steps are counted
+    assert formation.frames[BLURRED].steps > often[BLURRED].steps  # its steps are counted
     np.testing.assert_array_equal(formation.frames[BLURRED].motion.vector, BLUR.vector)
 
 
@@ -344,8 +347,8 @@ def test_frames_of_a_rolling_shutter_are_looked_at_in_every_training(
         return frame
 
     monkeypatch.setattr("cleargs.formation.capture.fit_motion", look)
-    draws = SETTLED * LOOK.every
-    rolling = {k: FrameFormation(k, BLUR, "blur", skew_gain=0.2, draws=draws) for k in range(FRAMES)}
+    steps = ESTIMATES_TO_KEEP * LOOK.every
+    rolling = {k: FrameFormation(k, BLUR, "blur", skew_gain=0.2, steps=steps) for k in range(FRAMES)}
     run(tmp_path, views(), CaptureFormation(views(), LOOK, known=rolling))
     assert min(looked.count(k) for k in range(FRAMES)) >= CONFIG.steps // FRAMES // LOOK.every
 
@@ -356,7 +359,7 @@ def test_the_next_training_counts_on_and_does_not_search(tmp_path: Path, searche
     write_formation(tmp_path / "formation.parquet", first, dict.fromkeys(range(FRAMES), 1.0))
     frames, _ = read_formation(tmp_path / "formation.parquet")
     second = CaptureFormation(views(), LOOK, known=frames)
-    assert all(frame.draws == first.frames[k].draws > 0 for k, frame in second.frames.items())
+    assert all(frame.steps == first.frames[k].steps > 0 for k, frame in second.frames.items())
     searched.clear()
     run(tmp_path / "second", views(), second)
     assert not searched
@@ -401,7 +404,7 @@ def test_a_repair_does_not_teach_where_its_frame_moves() -> None:
         view = replace(views()[1], kind=kind)
         formed = formation.form(view, 1.0, 0.0, target, mask, lambda camera: pytest.fail("no look is due"))
         assert formed is not None and formed.mask is not None
-        expected = mask & torch.from_numpy(still_pixels(cells, HEIGHT, WIDTH))
+        expected = mask & torch.from_numpy(static_pixels(cells, HEIGHT, WIDTH))
         assert torch.equal(formed.mask, expected) and not bool(expected.all())
     other = formation.form(views()[2], 1.0, 0.0, target, mask, lambda camera: pytest.fail("no look is due"))
     assert other is None
@@ -509,7 +512,7 @@ def test_after_each_round_of_looks_the_common_skew_is_asked_for(
 
     class Speeds:
         def missing_skew(self, frames: dict[int, FrameFormation]) -> Any:
-            rounds.append([frame.draws for frame in frames.values()])
+            rounds.append([frame.steps for frame in frames.values()])
             return missing if len(rounds) == 2 else None
 
     monkeypatch.setattr(CameraSpeeds, "of", lambda views: Speeds())
@@ -524,9 +527,9 @@ def test_after_each_round_of_looks_the_common_skew_is_asked_for(
     run(tmp_path, seen, formation)
     # 60 steps on five frames, looked at after every fourth step on them.
     assert len(rounds) == 3
-    for k, draws in enumerate(rounds):
+    for k, steps in enumerate(rounds):
         # The last frame of a round is counted after its look.
-        assert sorted(draws) == [4 * k, *[4 * k + 1] * 4]
+        assert sorted(steps) == [4 * k, *[4 * k + 1] * 4]
     jumps = np.diff(np.array(skews), axis=0)
     together = [k for k, jump in enumerate(jumps) if (jump > 20.0).all()]
     assert len(together) == 1, "all frames get it in one step, once"
@@ -551,7 +554,7 @@ def test_trust_is_earned() -> None:
 
 def test_a_frame_without_a_fault_earns_trust_by_its_residual() -> None:
     """RVA gave soft close-ups of fur a tenth of the weight, and views near them lost 3 dB."""
-    known = {k: FrameFormation(k, residual=0.010, residual_without=0.010, draws=1) for k in range(FRAMES)}
+    known = {k: FrameFormation(k, residual=0.010, residual_without=0.010, steps=1) for k in range(FRAMES)}
     seen = views(weights=[1.0, 1.0, 1.0, 1.0, 0.12])
     formation = CaptureFormation(seen, LOOK, known=known)
     assert formation.weight(4) == 1.0

@@ -53,7 +53,7 @@ def test_a_measured_blur_needs_no_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
 ) -> None:
     """Only its exposure time is unknown."""
-    monkeypatch.setattr("cleargs.formation.look.search", None)
+    monkeypatch.setattr("cleargs.formation.estimate.search", None)
     seen = filmed({BLURRED: blurred()})
     formation = CaptureFormation(seen, LOOK, measured={k: measured(error=error) for k in range(FRAMES)})
     run(tmp_path, seen, formation)
@@ -151,7 +151,7 @@ def test_a_checkpoint_keeps_every_bit_of_a_formation() -> None:
     vector = np.random.default_rng(1).normal(0, 1, 36)
     vector[::5] = -0.0
     motion = FrameMotion(exposure_s=EXPOSURE_S, columns=True, median_depth=DEPTH).with_vector(vector)
-    frame = FrameFormation(3, motion, "both", residual=0.1, skew_gain=0.2, blur_gain=0.05, draws=7)
+    frame = FrameFormation(3, motion, "both", residual=0.1, skew_gain=0.2, blur_gain=0.05, steps=7)
     again = next(unpacked(packed([frame])))
     assert packed([again]).tobytes() == packed([frame]).tobytes()
     assert again.motion.vector.tobytes() == vector.tobytes()

@@ -10,7 +10,7 @@ import pytest
 from helpers.observations import picture
 
 from cleargs.formation.comparison import luminance
-from cleargs.formation.look import SEARCH_GAIN
+from cleargs.formation.estimate import SEARCH_GAIN
 from cleargs.formation.pretest import MissingBlur, missing_blur
 from cleargs.splat.backend import set_threads
 from cleargs.splat.kernels.cpu import backend as cpu

@@ -253,7 +253,7 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
     """From what the training has found: nothing is estimated again."""
     capture.use_good_scene()
     motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
-    found = FrameFormation(2, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0, draws=30)
+    found = FrameFormation(2, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0, steps=30)
     supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
     view = supervision.views[2]
     formation = CaptureFormation([view], FormationConfig(), known={2: found})

@@ -77,18 +77,18 @@ class Shot:
 
 @dataclass(frozen=True)
 class Terms:
-    """Facts about a frame and its capture on which a look depends."""
+    """Facts about a frame and its capture on which an estimate depends."""
 
     pose: bool = False
     """Correct the pose together with a motion."""
     low_weight: bool = False
     """RVA gives the frame a low weight, so less blur is enough for a search."""
-    shutter: Literal["still", "tested", "rolls"] = "still"
-    """still: no model with a skew; tested: none, but `FrameFormation.skew_gain` is measured; rolls: all."""
+    shutter: Literal["global", "tested", "rolling"] = "global"
+    """global: no model has a skew; tested: none, but the `FrameFormation.skew_gain` is measured."""
     curve: bool = False
     """Try a higher order of the path, and search a frame with a curved path or a rolling shutter."""
     only_if_blur_found: bool = False
-    """Skip the first search unless the test finds a blur that `_Look._resembles` admits."""
+    """Skip the first search unless the test finds a blur that `_Estimate._resembles` admits."""
     exposure_s: float = 0.0
     """Exposure time of the frames around this one, s; 0: it is not known."""
     measured: MeasuredPath | None = None
@@ -116,19 +116,19 @@ def fit_motion(
     The known formation is refined, or the measured motion is followed. The frame is searched only for a
     `Reason`.
     """
-    look = _Look(frame, config, shot, terms)
-    found = look.followed()
-    best = look.accepted(found[1:] or found, found[0])
-    missing = look.unexplained(best)
-    if look.reason(found, best, missing) is None:
-        return look.described(best, min(frame.blur_gain, missing.gain))
-    found = look.searched(found, best, missing)
-    best = look.accepted(found, found[0])
-    return look.described(best, look.unexplained(best).gain)
+    estimate = _Estimate(frame, config, shot, terms)
+    found = estimate.followed()
+    best = estimate.accepted(found[1:] or found, found[0])
+    missing = estimate.unexplained(best)
+    if estimate.reason(found, best, missing) is None:
+        return estimate.described(best, min(frame.blur_gain, missing.gain))
+    found = estimate.searched(found, best, missing)
+    best = estimate.accepted(found, found[0])
+    return estimate.described(best, estimate.unexplained(best).gain)
 
 
-class _Look:
-    """One look at a frame, with the present scene."""
+class _Estimate:
+    """One estimate of a frame's formation, with the present scene."""
 
     def __init__(self, frame: FrameFormation, config: FormationConfig, shot: Shot, terms: Terms) -> None:
         self._frame, self._config, self._shot, self._terms = frame, config, shot, terms
@@ -142,7 +142,7 @@ class _Look:
 
     @property
     def _known(self) -> FrameMotion:
-        """The known motion, at the size of this look."""
+        """The known motion, at the size of this estimate."""
         return _scaled(self._frame.motion, self._shot.factor)
 
     @property
@@ -183,7 +183,7 @@ class _Look:
             found.append(self._corrected(measured, path))
         if self._terms.exposure_s > 0.0:
             found += self._best_of(measured, np.array([self._terms.exposure_s]))
-        if self._frame.draws == 0 or self._terms.curve:
+        if self._frame.steps == 0 or self._terms.curve:
             coarse = self._best_of(measured, EXPOSURES * measured.frame_s)[0].motion.exposure_s
             found += self._best_of(measured, NEARER * coarse)
         return found
@@ -204,22 +204,22 @@ class _Look:
         known = measured.measurement(path.exposure_s, self._shot.camera, path.median_depth)
         return corrected(self._pair, path, known, pose=self._terms.pose)
 
-    def accepted(self, found: list[MotionFit], still: MotionFit) -> MotionFit:
-        """Return the best of ``found`` that explains enough more than ``still``, else ``still``.
+    def accepted(self, found: list[MotionFit], without: MotionFit) -> MotionFit:
+        """Return the best of ``found`` that explains enough more than ``without``, else ``without``.
 
         The model that the frame had needs only half as much, and so does a measured motion. A measured motion
         during the exposure time of the frames around it must only explain no less.
         """
         best = preferred(found)
-        if best.model == still.model:
-            return min(best, still, key=lambda fit: fit.residual)
+        if best.model == without.model:
+            return min(best, without, key=lambda fit: fit.residual)
         known = best.model == self._frame.model or best.motion.exposure_s > 0.0
-        gain = explained_share(best.residual, still.residual)
+        gain = explained_share(best.residual, without.residual)
         if gain >= self._config.accept * (0.5 if known else 1.0):
             return best
         alike = [fit for fit in found if 0.0 < fit.motion.exposure_s == self._terms.exposure_s]
-        exposed = min(alike, key=lambda fit: fit.residual, default=still)
-        return exposed if exposed.residual <= still.residual else still
+        exposed = min(alike, key=lambda fit: fit.residual, default=without)
+        return exposed if exposed.residual <= without.residual else without
 
     def unexplained(self, fit: MotionFit) -> MissingBlur:
         """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
@@ -227,13 +227,13 @@ class _Look:
 
     def reason(self, found: list[MotionFit], best: MotionFit, missing: MissingBlur) -> Reason | None:
         """Return the reason to search the frame; None if there is none."""
-        frame, terms, rolls = self._frame, self._terms, self._terms.shutter == "rolls"
+        frame, terms, rolls = self._frame, self._terms, self._terms.shutter == "rolling"
         if terms.measured is None:
             # A formation that was found under the other assumption about the shutter is searched again.
             unmeasured = frame.skew_gain is None or frame.skew_gain > self._config.accept
             if terms.shutter == "tested" or (rolls and unmeasured and _admitted(frame.model, rolling=False)):
                 return Reason.SHUTTER
-            if frame.draws == 0 and not terms.only_if_blur_found:
+            if frame.steps == 0 and not terms.only_if_blur_found:
                 return Reason.FIRST
             if not _admitted(frame.model, rolls):
                 return Reason.MODEL
@@ -260,12 +260,12 @@ class _Look:
             self._show(wide)
         resting = self._resting() if self._held is not None else followed[0]
         whole = missing if best.model == resting.model else self.unexplained(resting)
-        skews = terms.shutter != "still" and terms.measured is None
+        skews = terms.shutter != "global" and terms.measured is None
         found = search(
             self._pair,
             start=None if skews else blur_along(whole.length, whole.angle),
             skew=skews,
-            defocus=terms.shutter == "rolls" or whole.disc_gain > whole.line_gain,
+            defocus=terms.shutter == "rolling" or whole.disc_gain > whole.line_gain,
             pose=terms.pose,
             held=self._held,
         )
@@ -278,7 +278,7 @@ class _Look:
                 found.append(finest_level(self._pair).evaluate(model, motion))
             else:
                 found += refine(self._pair, model, motion, pose=terms.pose)[1:]
-        rolls = terms.shutter == "rolls" or self._held is not None
+        rolls = terms.shutter == "rolling" or self._held is not None
         return [fit for fit in found if _admitted(fit.model, rolls)]
 
     def described(self, best: MotionFit, gain: float) -> FrameFormation:
@@ -314,9 +314,9 @@ def _admitted(model: Model, rolling: bool) -> bool:
 
 def _skew_gain(found: list[MotionFit]) -> float:
     """Return the share by which the best model with a skew reduces the residual of the best one without."""
-    still = preferred([e for e in found if _admitted(e.model, rolling=False)])
+    without = preferred([e for e in found if _admitted(e.model, rolling=False)])
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
-    return max(0.0, explained_share(rolled.residual, still.residual))
+    return max(0.0, explained_share(rolled.residual, without.residual))
 
 
 def frame_pair(
@@ -358,7 +358,7 @@ def _described(
             residual_without=best.residual_without,
             skew_gain=frame.skew_gain,
             blur_gain=frame.blur_gain,
-            draws=frame.draws,
+            steps=frame.steps,
         )
     motion = _scaled(best.motion, 1.0 / factor)
     depth, alpha = rendered.depth, rendered.alpha
