@@ -48,7 +48,7 @@ LABELS: Mapping[str, str] = {
     "median_px": "median distance, px",
     "focal_px": "focal length, px",
     "focal_range_px": "shortest and longest focal length, px",
-    "stand_in": "stand-ins for reliable frames",
+    "fallback": "frames in place of reliable ones",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
     "bins_uncovered_before": "sections without a usable frame at first",

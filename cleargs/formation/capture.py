@@ -143,7 +143,7 @@ class CaptureFormation:
 
         rho is the median residual of the frames, weighted by w_RVA, and p is `FormationConfig.trust`. A frame
         that is explained as well as reliable frames counts like one of them, also if it needs no model: RVA
-        can mistake a sharp photograph of soft things, such as fur, for a blurred one.
+        can mistake a sharp frame image of soft things, such as fur, for a blurred one.
         """
         prior, frame = self._weights[frame_id], self._frames[frame_id]
         if frame.residual <= 0.0:  # not compared with the scene so far

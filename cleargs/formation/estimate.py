@@ -23,7 +23,7 @@ from cleargs.formation.comparison import (
     finest_level,
     luminance,
 )
-from cleargs.formation.frame import FrameFormation, margin_for, reach_of
+from cleargs.formation.frame import FrameFormation, displacement_of, margin_for
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.motion import FrameMotion, Model, widened
 from cleargs.formation.pretest import MissingBlur, missing_blur
@@ -132,7 +132,7 @@ class _Estimate:
 
     def __init__(self, frame: FrameFormation, config: FormationConfig, shot: Shot, terms: Terms) -> None:
         self._frame, self._config, self._shot, self._terms = frame, config, shot, terms
-        self._show(margin_for(frame.reach_px * shot.factor, shot.camera))
+        self._show(margin_for(frame.displacement_px * shot.factor, shot.camera))
 
     def _show(self, margin: int) -> None:
         """Render the scene with a margin."""
@@ -377,7 +377,7 @@ def _described(
         blur_px=float(path_lengths(whole).mean(dtype=np.float64)) / factor,
         skew_px=float(path_lengths(turned).mean(dtype=np.float64)) / factor,
         defocus_px=float(whole.radius.cpu().numpy().mean(dtype=np.float64)) / factor,
-        reach_px=reach_of(whole) / factor,
+        displacement_px=displacement_of(whole) / factor,
     )
 
 

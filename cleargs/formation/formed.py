@@ -54,7 +54,7 @@ class FormedView:
             self.camera = replace(self.camera, readout=readout)
             self._motion = self._motion.exposed_only()
         if self.formation is not None and self._motion is not None:
-            self._margin = margin_for(self.formation.reach_px * self.factor, self._frame_camera)
+            self._margin = margin_for(self.formation.displacement_px * self.factor, self._frame_camera)
             self.camera = widened(self.camera, self._margin)
         self.needs_depth = self._motion is not None or self.check is not None
 

@@ -22,7 +22,7 @@ MARGIN_SHARE = 0.25
 """Largest margin, as a share of the shorter side."""
 
 LENS = ("disc_px", "focus", "median_depth", "exposure_s")
-MEASURED = ("residual", "residual_without", "blur_px", "skew_px", "defocus_px", "reach_px")
+MEASURED = ("residual", "residual_without", "blur_px", "skew_px", "defocus_px", "displacement_px")
 """Fields of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 
@@ -43,7 +43,7 @@ class FrameFormation:
     """Mean length of the pixels' paths from the first to the last row's exposure."""
     defocus_px: float = 0.0
     """Mean radius of the discs of defocus."""
-    reach_px: float = 0.0
+    displacement_px: float = 0.0
     """Largest displacement of a pixel's samples along an axis: the 95th percentile over the pixels."""
     skew_gain: float | None = None
     """Share of the residual that a rolling shutter explains beyond blur and defocus, by the last search that
@@ -67,9 +67,9 @@ class FrameFormation:
 def filmed_as(motion: FrameMotion, frame_id: int = -1) -> FrameFormation:
     """Return the formation of a frame with a measured ``motion``."""
     # No pixel moves farther than at the first and at the last row, and at the ends of the exposure.
-    reach = 0.5 * float(np.abs(motion.skew).sum() + np.abs(motion.blur).sum())
+    displacement = 0.5 * float(np.abs(motion.skew).sum() + np.abs(motion.blur).sum())
     model = named("blur" if motion.blur.any() else "none", motion)
-    return FrameFormation(frame_id, motion, model, reach_px=reach)
+    return FrameFormation(frame_id, motion, model, displacement_px=displacement)
 
 
 def described(frame: FrameFormation) -> str:
@@ -79,8 +79,8 @@ def described(frame: FrameFormation) -> str:
     return ", ".join(f"{part} {lengths[part]:.1f} px" for part in parts if part in lengths) or "nothing"
 
 
-def reach_of(fields: DisplacementFields) -> float:
-    """Return the reach of the pixels, px: see `FrameFormation.reach_px`."""
+def displacement_of(fields: DisplacementFields) -> float:
+    """Return the displacement of the pixels, px: see `FrameFormation.displacement_px`."""
     few = (..., slice(None, None, 4), slice(None, None, 4))
     displacements = fields.offset[few].abs() + 0.5 * fields.sweep[few].abs() + fields.radius[few]
     if fields.curve is not None:
@@ -89,10 +89,10 @@ def reach_of(fields: DisplacementFields) -> float:
     return float(np.quantile(displacements.amax(dim=0).cpu().numpy(), 0.95))
 
 
-def margin_for(reach: float, camera: Camera) -> int:
+def margin_for(displacement: float, camera: Camera) -> int:
     """Return the margin, px, that contains the pixels that moved in from outside the border."""
     largest = int(MARGIN_SHARE * min(camera.width, camera.height)) // MARGIN_STEP * MARGIN_STEP
-    return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
+    return min(largest, MARGIN_STEP * math.ceil(displacement / MARGIN_STEP)) if displacement >= 0.5 else 0
 
 
 def as_row(frame: FrameFormation) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""Test in a few milliseconds if a photograph has blur that a render does not have, and in which direction.
+"""Test in a few milliseconds if a frame image has blur that a render does not have, and in which direction.
 
-For a small blur of covariance S the photograph is
+For a small blur of covariance S the frame image is
 
     offset + gain * render + shift . grad(render) + tr(S H(render)) / 2
 
@@ -45,13 +45,13 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class MissingBlur:
-    """Blur that a photograph has and a render has not. Lengths are in pixels of the photograph."""
+    """Blur that a frame image has and a render has not. Lengths are in pixels of the frame image."""
 
     line_gain: float
     """Share of the squared error on unseen tiles that a blur along one direction removes."""
     line: float
     """Variance of that blur, px^2: L^2 / 12 for a straight sweep of length L. Negative where the render is
-    blurrier than the photograph."""
+    blurrier than the frame image."""
     angle: float
     """Direction of that blur, radians from the x axis towards the y axis."""
     disc_gain: float
@@ -106,7 +106,7 @@ def _reduced(image: PlaneF32, size: tuple[int, int], *, smooth: bool = True) -> 
 
 def _fitted(
     sums: ArrayF64,  # [2, 8, 8] products of the regressors over the tiles of each colour
-    pixel: float,  # photograph pixels per pixel of this size
+    pixel: float,  # pixels of the frame image per pixel of this size
 ) -> MissingBlur:
     halves = (sums[0], sums[1]), (sums[1], sums[0])
 

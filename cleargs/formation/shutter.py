@@ -116,8 +116,8 @@ def with_skew(frame: FrameFormation, twist: ArrayF64) -> FrameFormation:
         return frame
     added = twist / _scale(frame.motion.median_depth)
     motion = replace(frame.motion, skew=frame.motion.skew + added)
-    reach = frame.reach_px + 0.5 * float(np.abs(added).sum())
-    return replace(frame, model=WITH_SKEW[frame.model], motion=motion, reach_px=reach)
+    displacement = frame.displacement_px + 0.5 * float(np.abs(added).sum())
+    return replace(frame, model=WITH_SKEW[frame.model], motion=motion, displacement_px=displacement)
 
 
 def _scale(median_depth: float) -> ArrayF64:  # [6]

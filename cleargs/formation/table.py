@@ -38,7 +38,7 @@ FORMATION = pa.schema(
             "skew_px", pa.float64(), "mean length of the paths from the first row's time to the last's, px"
         ),
         column("defocus_px", pa.float64(), "mean radius of the discs of defocus, px"),
-        column("reach_px", pa.float64(), "distance from a pixel to what it shows: 95 % quantile, px"),
+        column("displacement_px", pa.float64(), "distance from a pixel to what it shows: 95 % quantile, px"),
         column("explained", pa.float64(), "share of the frame's residual that the model removes"),
         column("residual", pa.float64(), "mean difference of high-passed linear luminance with the model"),
         column("residual_without", pa.float64(), "the same difference without the model"),

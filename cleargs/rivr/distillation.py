@@ -14,7 +14,7 @@ from cleargs.formation.movement import TOLERANCE
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import hide_masked
-from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, harm_of
+from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, compare_on_controls
 from cleargs.rivr.targets import Supervision
 from cleargs.scene.folder import SceneFolder
 from cleargs.scene.training import train_into
@@ -122,4 +122,4 @@ def check_harm(
     """
     views = [supervision.views[frame_id] for frame_id in supervision.controls] if repaired else []
     before, after = fidelity(g0, views, scorer, threads), fidelity(trained, views, scorer, threads, g0)
-    return harm_of(supervision.controls, before, after, limits)
+    return compare_on_controls(supervision.controls, before, after, limits)

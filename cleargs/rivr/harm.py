@@ -54,7 +54,7 @@ class HarmCheck:
     """The figure that fell by more than its margin; None if the distilled scene is published."""
 
 
-def harm_of(
+def compare_on_controls(
     frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
 ) -> HarmCheck:
     """Compare a distilled scene with G0 on the control frames ``frames``; without any there is no harm.

@@ -52,7 +52,7 @@ def frames_to_repair(
     return sorted(frame_id for k, (spared, *_, frame_id) in ranked if k < least or not spared)
 
 
-def rows_of_others(
+def untried_rows(
     targets: Collection[int], supervision: Supervision, formations: Mapping[int, FrameFormation]
 ) -> list[Selection]:
     """Return a row for every frame that no round repairs, with the reason to keep it as filmed."""

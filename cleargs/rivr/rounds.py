@@ -173,7 +173,7 @@ def repair(
     return row, LayeredImage(layers, {ROW: json.dumps(asdict(row))})
 
 
-def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
+def forget_other_frames(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
     """Remove files that do not belong to the EXRs of ``targets`` in rounds 1 to ``rounds``."""
     ours = {
         f"round_{number:02d}/{view.frame_id:06d}.exr" for number in range(1, rounds + 1) for view in targets

@@ -19,7 +19,7 @@ from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 from cleargs.types import MaskBool
 
 MAX_EVALUATED = 32
-"""Maximum number of frames, evenly spread, on which a stage compares its scene with the photographs."""
+"""Maximum number of frames, evenly spread, on which a stage compares its scene with the frame images."""
 
 
 class ViewPsnr(NamedTuple):

@@ -69,14 +69,14 @@ class Formation(Protocol):
 
 
 SATURATED = 253 / 255
-"""Value (sRGB) from which a photograph is saturated: the light was as bright as this or brighter."""
+"""Value (sRGB) from which a frame image is saturated: the light was as bright as this or brighter."""
 
 
-def recorded(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a render as the sensor of a photograph records it, and a mask of the values that change.
+def clip_to_saturation(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a render as the sensor of a frame image records it, and a mask of the values that change.
 
-    Both images are [H, W, 3] sRGB. If the photograph is saturated and the render is brighter, the value of
-    the photograph replaces that of the render. So one overexposed frame does not darken a lamp.
+    Both images are [H, W, 3] sRGB. If the frame image is saturated and the render is brighter, the value of
+    the frame image replaces that of the render. So one overexposed frame does not darken a lamp.
     """
     too_bright = (target >= SATURATED) & (image > target)
     return torch.where(too_bright, target, image), too_bright

@@ -31,7 +31,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.densification import relative_error
 from cleargs.splat.densifier import Densifier, DensifierState, load_densifier
-from cleargs.splat.formation import Formation, Formed, recorded
+from cleargs.splat.formation import Formation, Formed, clip_to_saturation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.interruption import deferred_sigterm
 from cleargs.splat.kernels.cuda import support
@@ -219,7 +219,7 @@ class Trainer:
             affine = None if formed is None else formed.affine
             target = _over(target, alpha, colour or self._scene.background, affine)
             mask = mask if formed is None else _with_empty(formed.mask, mask, alpha)
-        image, too_bright = recorded(image, target)
+        image, too_bright = clip_to_saturation(image, target)
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         with timed("loss"):
             gradient = self._add_loss(image, target, mask, weight)

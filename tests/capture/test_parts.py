@@ -29,7 +29,7 @@ from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.layouts.video import _shares, choose_times
 from cleargs.capture.matching import loop_pairs, sequential_pairs
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
-from cleargs.capture.prepare import WorkFrame, read_image, read_stencil
+from cleargs.capture.prepare import WorkFrame, read_image, read_source_mask
 from cleargs.capture.sfm import job_of
 from cleargs.capture.sources import externals, open_capture
 from cleargs.capture.undistort import MAX_TANGENT, undistorter
@@ -462,8 +462,8 @@ def test_a_camera_that_fits_the_stored_image_keeps_it_so(tmp_path: Path, orienta
     alone = SourceFrame("turned.png", path)
     turns = {1: 0, 3: 2, 6: 3}[orientation]
     assert np.array_equal(read_image(alone), np.rot90(pixels[..., :3], turns))
-    stencil = read_stencil(alone)
-    assert stencil is not None and np.array_equal(stencil > 0, np.rot90(pixels[..., 3] > 127, turns))
+    source_mask = read_source_mask(alone)
+    assert source_mask is not None and np.array_equal(source_mask > 0, np.rot90(pixels[..., 3] > 127, turns))
 
 
 def write_oriented(path: Path, pixels: np.ndarray, orientation: int) -> None:
@@ -549,7 +549,7 @@ def test_a_mask_turns_with_its_image_if_it_was_made_on_the_stored_pixels(
     for pixels, fits in ((stored, quarter or form == "a.jpg.png"), (upright, quarter or form == "a.png")):
         cv2.imwrite(str(mask), pixels)
         if fits:
-            found = read_stencil(frame)
+            found = read_source_mask(frame)
             assert found is not None and np.array_equal(found, upright)
 
 

@@ -88,7 +88,7 @@ def views(
     made = []
     for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
         view = TrainingView(index, camera(angle), 1.0, "real", lambda: (None, None))
-        moved = FrameFormation(index, motion, "blur", reach_px=4.0) if index == blurred else None
+        moved = FrameFormation(index, motion, "blur", displacement_px=4.0) if index == blurred else None
         seen = render_formed(scene(), view, formation=moved).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         weight = 1.0 if weights is None else weights[index]
@@ -217,7 +217,9 @@ def known(**blurs: FrameMotion) -> dict[int, FrameFormation]:
     still = {k: FrameFormation(k, skew_gain=NO_TEST, steps=LOOK.every) for k in range(FRAMES)}
     moved = {int(name[1:]): motion for name, motion in blurs.items()}
     return still | {
-        k: FrameFormation(k, motion, "blur", blur_px=7.0, reach_px=4.0, skew_gain=NO_TEST, steps=LOOK.every)
+        k: FrameFormation(
+            k, motion, "blur", blur_px=7.0, displacement_px=4.0, skew_gain=NO_TEST, steps=LOOK.every
+        )
         for k, motion in moved.items()
     }
 
@@ -458,7 +460,7 @@ def skewed(frames: list[int]) -> list[TrainingView]:
     """The views, with a rolling shutter in these."""
     made = []
     for view in views(blurred=None):
-        moved = FrameFormation(view.frame_id, SKEW, "skew", reach_px=5.0)
+        moved = FrameFormation(view.frame_id, SKEW, "skew", displacement_px=5.0)
         seen = render_formed(scene(), view, formation=moved if view.frame_id in frames else None).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         made.append(
@@ -470,7 +472,7 @@ def skewed(frames: list[int]) -> list[TrainingView]:
 def test_a_twist_is_the_motion_of_the_scene_past_the_camera() -> None:
     """The last rows of a skewed frame are those of a camera turned by half the skew."""
     view = views(blurred=None)[2]
-    moved = FrameFormation(2, SKEW, "skew", reach_px=5.0)
+    moved = FrameFormation(2, SKEW, "skew", displacement_px=5.0)
     seen = render_formed(scene(), view, formation=moved)[-4:, 8:-8]
     difference = {}
     for side in (-1, 1):
@@ -583,14 +585,14 @@ def test_the_table_gives_back_what_was_found(tmp_path: Path) -> None:
     assert sorted(back) == list(range(FRAMES))
     assert back[2].model == "both"
     np.testing.assert_array_equal(back[2].motion.vector, motion.vector)
-    assert (back[2].motion.disc_px, back[2].motion.focus, back[2].reach_px) == (2.0, 1.5, 5.0)
+    assert (back[2].motion.disc_px, back[2].motion.focus, back[2].displacement_px) == (2.0, 1.5, 5.0)
     assert back[2].explained == 0.5
 
 
 def test_a_frame_is_rendered_with_a_margin() -> None:
     """Content that moved in from outside the border is explained too."""
     seen = views()
-    moved = FrameFormation(BLURRED, BLUR, "blur", reach_px=4.0)
+    moved = FrameFormation(BLURRED, BLUR, "blur", displacement_px=4.0)
     wide = render_formed(scene(), seen[BLURRED], formation=moved)
     without = render_formed(scene(), seen[BLURRED], formation=FrameFormation(BLURRED, BLUR, "blur"))
     assert (wide - without)[4:-4, 8:-8].abs().max() < 1e-5

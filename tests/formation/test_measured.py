@@ -45,7 +45,7 @@ def filmed(motions: dict[int, FrameFormation]) -> list[TrainingView]:
 
 def blurred() -> FrameFormation:
     motion = measured().exposed(EXPOSURE_S, camera(0.0))
-    return FrameFormation(BLURRED, motion, "blur", reach_px=4.0)
+    return FrameFormation(BLURRED, motion, "blur", displacement_px=4.0)
 
 
 @pytest.mark.parametrize("error", [0.0, 0.1])
@@ -117,7 +117,7 @@ def test_frames_with_little_blur_get_the_exposure_time_of_those_around(tmp_path:
     slow = replace(measured(), path=0.2 * measured().path)
     paths = {k: slow if k == 0 else measured() for k in range(FRAMES)}
     motions = {
-        k: FrameFormation(k, path.exposed(EXPOSURE_S, camera(0.0)), "blur", reach_px=4.0)
+        k: FrameFormation(k, path.exposed(EXPOSURE_S, camera(0.0)), "blur", displacement_px=4.0)
         for k, path in paths.items()
     }
     formation = CaptureFormation(filmed(motions), LOOK, measured=paths)

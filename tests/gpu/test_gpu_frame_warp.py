@@ -111,7 +111,7 @@ def test_a_training_through_the_warp_follows_the_cpu(
         "defocus": FrameMotion(disc_px=1.2, focus=1.4, **depth),
     }
     known = {
-        index: FrameFormation(index, motion, model, residual=0.1, residual_without=0.2, reach_px=3.0)
+        index: FrameFormation(index, motion, model, residual=0.1, residual_without=0.2, displacement_px=3.0)
         for index, (model, motion) in enumerate(motions.items())
     }
     config = TrainConfig(steps=3, densify=False, coarse_share=0.0, lr_means=2e-3)

@@ -185,10 +185,10 @@ class FinishedRun:
             row |= {f"r_{name}": 0.9 for name in R_CUES}
             row |= {"frame_id": index, "name": "", "evaluator": "test-1", "R": 0.8, "B": 0.1, "G": 0.3}
             row |= {"role": ROLES[index], "weight": WEIGHTS[index], "b_motion_blur": 0.7, "reliable": True}
-            row |= {"stand_in": False}
+            row |= {"fallback": False}
             rows.append(row)
         write_table(self.folder / "rva/frames.parquet", pa.Table.from_pylist(rows, RVA_FRAMES), RVA_FRAMES)
-        self.finish("rva", {"effective_frames": 2.7, "bins_uncovered_before": 1, "stand_in": 0})
+        self.finish("rva", {"effective_frames": 2.7, "bins_uncovered_before": 1, "fallback": 0})
 
     def _trained(self, stage: str, summary: dict[str, Any]) -> None:
         folder = self.folder / stage

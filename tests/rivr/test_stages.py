@@ -230,7 +230,7 @@ def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
         for k in TARGETS
     ]
     motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
-    known = {blurred: FrameFormation(blurred, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0)}
+    known = {blurred: FrameFormation(blurred, motion, "blur", 0.001, 0.01, 6.0, displacement_px=3.0)}
     weights = {view.frame_id: view.weight for view in views}
     formation = CaptureFormation(views, FormationConfig(), known=known)
     write_formation(capture.root / "g0" / "formation.parquet", formation, weights)
@@ -253,7 +253,7 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
     """From what the training has found: nothing is estimated again."""
     capture.use_good_scene()
     motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
-    found = FrameFormation(2, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0, steps=30)
+    found = FrameFormation(2, motion, "blur", 0.001, 0.01, 6.0, displacement_px=3.0, steps=30)
     supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
     view = supervision.views[2]
     formation = CaptureFormation([view], FormationConfig(), known={2: found})

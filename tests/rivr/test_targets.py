@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 
 from cleargs.formation.frame import FrameFormation
-from cleargs.rivr.need import frames_to_repair, rows_of_others
+from cleargs.rivr.need import frames_to_repair, untried_rows
 from cleargs.rivr.targets import FrameAssessment, Supervision, select_controls
 
 
-def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[FrameAssessment]:
+def appraised(roles: list[str], fallback: set[int] | None = None) -> list[FrameAssessment]:
     """One frame a role, with ids 10, 11, ..."""
     return [
         FrameAssessment(
-            10 + k, R=0.5, B=0.5, role=role, reliable=role == "strong", stand_in=10 + k in (stand_in or set())
+            10 + k, R=0.5, B=0.5, role=role, reliable=role == "strong", fallback=10 + k in (fallback or set())
         )
         for k, role in enumerate(roles)
     ]
@@ -61,7 +61,7 @@ def test_auto_tries_two_frames_at_least_and_a_sixteenth_of_many() -> None:
 
 def test_every_frame_that_is_not_tried_says_why_it_is_kept() -> None:
     formations = found(f10=0.01) | {11: FrameFormation(11, model="blur", blur_px=5.2)}
-    rows = {row.frame_id: row for row in rows_of_others([12, 14, 15], supervision(), formations)}
+    rows = {row.frame_id: row for row in untried_rows([12, 14, 15], supervision(), formations)}
     assert {frame_id: row.reason for frame_id, row in rows.items()} == {
         10: "not tried: needs no repair",
         11: "not tried: explained: blur 5.2 px",
@@ -93,6 +93,6 @@ def test_the_sharpest_of_each_part_is_held_back() -> None:
 
 
 def test_the_stand_in_set_replaces_missing_strong_frames() -> None:
-    assert select_controls(appraised(["suppressed"] * 5, stand_in={12})) == [12]
-    assert select_controls(appraised(["strong", "suppressed"], stand_in={11})) == [10]
+    assert select_controls(appraised(["suppressed"] * 5, fallback={12})) == [12]
+    assert select_controls(appraised(["strong", "suppressed"], fallback={11})) == [10]
     assert select_controls(appraised(["suppressed"])) == []

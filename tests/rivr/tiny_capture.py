@@ -245,7 +245,7 @@ def rva_row(k: int) -> dict[str, Any]:
         "bin": 0,
         "role": ROLES[k],
         "weight": WEIGHTS[k],
-        "stand_in": False,
+        "fallback": False,
         "reactivated_for": None,
     }
     return {name: known.get(name, 0.0) for name in RVA_FRAMES.names}

@@ -26,7 +26,7 @@ from cleargs.scene.measure import ViewPsnr, evaluate_views, pooled_unseen
 from cleargs.splat import trainer as trainer_module
 from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
-from cleargs.splat.formation import recorded
+from cleargs.splat.formation import clip_to_saturation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
@@ -151,7 +151,7 @@ def test_saturated_pixels_do_not_darken_the_scene(pictures: list[np.ndarray], tm
 def test_a_saturated_channel_bounds_the_render_from_below() -> None:
     target = torch.tensor([[[1.0, 1.0, 0.5], [254 / 255, 0.9, 0.0]]])
     image = torch.tensor([[[1.3, 0.8, 0.7], [1.1, 1.2, 0.1]]])
-    image_recorded, clipped = recorded(image, target)
+    image_recorded, clipped = clip_to_saturation(image, target)
     assert clipped.tolist() == [[[True, False, False], [True, False, False]]]
     assert torch.equal(image_recorded, torch.where(clipped, target, image))
 
