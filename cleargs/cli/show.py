@@ -34,7 +34,7 @@ from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import linked_manifests
 
 MAX_LISTED = 16  # items of a list that are printed
-HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
+HIDDEN = frozenset({"holdout_hash", "round"})  # figures that only programs need
 
 LABELS: Mapping[str, str] = {
     "registered": "frames with a pose",

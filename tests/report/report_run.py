@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import torch
 
+from cleargs.capture.cameras import Similarity
 from cleargs.capture.tables import FRAMES
 from cleargs.digest import file_digest, tree_digest
 from cleargs.formation.exposure import Exposure, write_exposure
@@ -171,10 +172,8 @@ class FinishedRun:
             )
         write_table(folder / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
         turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-        similarity = {"scale": 2.5, "rotation": turn.tolist(), "translation": [1.0, -2.0, 3.0]}
-        self.finish(
-            "ingest", {"frames": COUNT, "frames_available": COUNT, "registered": 6, "similarity": similarity}
-        )
+        Similarity(turn.T, np.array([1.0, -2.0, 3.0]), 2.5).write(folder)
+        self.finish("ingest", {"frames": COUNT, "frames_available": COUNT, "registered": 6})
 
     def _rva(self) -> None:
         (self.folder / "rva").mkdir()
