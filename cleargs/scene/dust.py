@@ -18,7 +18,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.trainer import Trained
+from cleargs.splat.training import Trained
 from cleargs.splat.views import TrainingView
 from cleargs.types import MaskBool
 

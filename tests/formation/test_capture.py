@@ -28,7 +28,9 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.trainer import Trained, Trainer
+from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import Trained
+from cleargs.splat.training import run as run_training
 from cleargs.splat.views import TrainingView
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 5
@@ -99,7 +101,7 @@ def views(
 def run(folder: Path, seen: list[TrainingView], formation: CaptureFormation | None) -> Trained:
     folder.mkdir(exist_ok=True)
     trainer = Trainer(scene(), seen, CONFIG, seed=(3,), formation=formation)
-    return trainer.run(checkpoint=folder / "state.safetensors", reporter=SilentReporter())
+    return run_training(trainer, checkpoint=folder / "state.safetensors", reporter=SilentReporter())
 
 
 def test_a_blurred_frame_is_found_and_the_sharp_ones_are_left_alone(tmp_path: Path) -> None:

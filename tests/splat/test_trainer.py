@@ -23,7 +23,7 @@ from cleargs.formation.formed import render_formed
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.scene.measure import ViewPsnr, evaluate_views, pooled_unseen
-from cleargs.splat import trainer as trainer_module
+from cleargs.splat import training as training_module
 from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.formation import clip_to_saturation
@@ -32,7 +32,9 @@ from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.trainer import Trained, Trainer
+from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import Trained
+from cleargs.splat.training import run as run_training
 from cleargs.splat.types import Moments, Render
 from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
@@ -70,7 +72,7 @@ def run(pictures_or_views: Any, folder: Path, config: TrainConfig = CONFIG, **op
     arguments = {"scene": start(sh_degree=1), "seed": (7,), "reporter": SilentReporter()} | options
     scene, reporter, round = arguments.pop("scene"), arguments.pop("reporter"), arguments.pop("round", 0)
     trainer = Trainer(scene, made, config, **arguments)
-    return trainer.run(checkpoint=folder / "state.safetensors", reporter=reporter, round=round)
+    return run_training(trainer, checkpoint=folder / "state.safetensors", reporter=reporter, round=round)
 
 
 def affines(weights: list[float] | None = None, rate: float = CONFIG.lr_exposure) -> CaptureFormation:
@@ -584,8 +586,8 @@ def test_slow_checkpoints_become_rare(
         clock[0] += 1.0
         saved.append(int(state["step"]))
 
-    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(trainer_module, "save_state", slow_save)
+    monkeypatch.setattr(training_module.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(training_module, "save_state", slow_save)
     monkeypatch.setattr(Trainer, "step", slow_step)
     run(pictures, tmp_path, CONFIG.model_copy(update={"steps": 100, "checkpoint_interval": 10}))
     assert saved == [10, 50, 90]
