@@ -106,19 +106,11 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame of a row from `as_row`. Older tables lack some columns."""
-    twists = [row.get(f"{name}_{axis}") for name in TWISTS for axis in AXES]
-    # Not `or 0.0`, which would lose the sign of -0.0, and with it the bits of a resumed training.
-    vector = np.array([0.0 if value is None else value for value in twists])
-    lens = {name: row[name] for name in LENS if row.get(name) is not None}
-    return FrameFormation(
-        row["frame_id"],
-        FrameMotion(**lens, columns=bool(row.get("columns"))).with_vector(vector),
-        row["model"],
-        blur_gain=row.get("blur_gain") or 0.0,
-        steps=row.get("steps") or 0,
-        **{name: row[name] for name in (*MEASURED, "skew_gain")},
-    )
+    """Return the frame of a row from `as_row`."""
+    vector = np.array([row[f"{name}_{axis}"] for name in TWISTS for axis in AXES])
+    motion = FrameMotion(**{name: row[name] for name in LENS}, columns=bool(row["columns"]))
+    own = {name: row[name] for name in ("model", "steps", "blur_gain", *MEASURED, "skew_gain")}
+    return FrameFormation(row["frame_id"], motion.with_vector(vector), **own)
 
 
 def packed(frames: Iterable[FrameFormation]) -> NDArray[np.float64]:

@@ -131,9 +131,6 @@ def test_an_arc_is_found_and_kept_in_the_table(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.motion.vector, found.motion.vector)
     table = pq.read_table(path)
     assert table.column("order").to_pylist()[BLURRED] == found.motion.order
-    older = table.drop_columns([name for name in table.column_names if name.startswith(("bend", "cube"))])
-    pq.write_table(older.drop_columns("order"), path)  # as written before paths could be curved
-    assert read_formation(path)[0][BLURRED].motion.order == 1
 
 
 def test_a_wrong_pose_is_corrected_where_it_is_an_estimate(tmp_path: Path) -> None:
