@@ -55,9 +55,8 @@ def reference_of(
 ) -> Reference:
     """Return the reference for the scenes of a run, or for a scene in the world of ``directory``.
 
-    If the run's poses are from SfM, or were refined, the worlds are aligned by cameras of equal stems. Raises
-    InputError if files are missing or damaged, stems do not match, worlds do not align, or nothing was held
-    out.
+    Raises InputError if files are missing or damaged, stems do not match, worlds do not align, or nothing was
+    held out.
     """
     if run is None:
         if directory is None:

@@ -47,11 +47,18 @@ def resolve_device(
     test: bool = False,
     machine: Machine | None = None,  # None: this one
 ) -> Device:
-    """Return the device to use. Does not import torch, which would take seconds.
+    """Return the device to use, without an import of torch, which would take seconds.
 
-    ``auto`` keeps the device of an existing run (``kept``). Otherwise it uses a GPU that passed its self-test
-    and is faster than the CPU, and reports the reason to ``say``. With ``test``, it runs the self-test of a
-    GPU that was not tested yet. Raises InputError if the chosen or kept device is a GPU that cannot be used.
+    | choice | of the run (``kept``) | device |
+    |---|---|---|
+    | cpu | any | CPU |
+    | cuda | any | GPU |
+    | auto | cpu | CPU |
+    | auto | cuda | GPU; InputError if it failed its self-test |
+    | auto | none | GPU if it passed its self-test and is faster, else CPU; the reason goes to ``say`` |
+
+    With ``test``, a GPU that was not tested yet is tested. Raises InputError if a GPU in the table cannot be
+    used.
     """
     if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
