@@ -55,11 +55,12 @@ class IngestConfig(SfmConfig, CaptureConfig):
 FEW_FRAMES, GOOD_FRAMES = 20, 30
 """Number of frames below which a warning is given, and the number that it asks for."""
 
-VERSION = 22
+VERSION = 23
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
-OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "motion.parquet", "images", "colmap")
+TABLES = ("frames.parquet", "points.parquet", "observations.parquet", "motion.parquet")
+OUTPUTS = (*TABLES, "world.json", "images", "colmap")
 LEFTOVERS = ("images/*.png",)
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "pillow", "numpy", "scipy")
 
@@ -185,6 +186,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         reporter.info(f"{0 if loose is None else len(loose.xyz)} points of the input start Gaussians")
     model = publish(frames, scene.model, outcome, test, work, context.out, config.max_size, reporter, loose)
     write_motion(context.out / "motion.parquet", frames, motion)
+    scene.similarity.write(context.out)
     return StageResult(
         missing=contradictions(outcome, config, reporter),
         summary=IngestSummary(
@@ -206,7 +208,6 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             observations=sum(len(image.point_ids) for image in model.images.values()),
             mean_reprojection_error_px=round(float(model.error.mean()), 6),
             up="found" if scene.stood else "tops of the pictures",
-            similarity=scene.similarity.to_json(),
         ).figures()
         | motion.summary(),
     )

@@ -34,7 +34,7 @@ from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import linked_manifests
 
 MAX_LISTED = 16  # items of a list that are printed
-HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
+HIDDEN = frozenset({"holdout_hash", "round"})  # figures that only programs need
 
 LABELS: Mapping[str, str] = {
     "registered": "frames with a pose",
@@ -48,7 +48,7 @@ LABELS: Mapping[str, str] = {
     "median_px": "median distance, px",
     "focal_px": "focal length, px",
     "focal_range_px": "shortest and longest focal length, px",
-    "stand_in": "stand-ins for reliable frames",
+    "fallback": "frames in place of reliable ones",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
     "bins_uncovered_before": "sections without a usable frame at first",

@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Similarity, upright
-from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_json
-from cleargs.manifest import linked_manifest
 from cleargs.named_views import read_views
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.stages import installed
@@ -217,8 +215,7 @@ def _similarity(
     """Return the similarity from the world of the run to that of the files; {} for the identity."""
     similarity: dict[str, Any] = {}
     if options.world == "input":
-        manifest = linked_manifest(ingest.parent, ingest.name)
-        world = Similarity.from_json(IngestSummary.of(manifest).similarity, ingest)
+        world = Similarity.read(ingest)
         similarity = {"scale": world.scale, "rotation": world.rotation.T, "translation": world.origin}
     else:
         stand = np.eye(3) if options.upright is None else upright(_direction(options.upright, cameras))
