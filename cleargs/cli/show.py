@@ -48,6 +48,8 @@ LABELS: Mapping[str, str] = {
     "median_px": "median distance, px",
     "focal_px": "focal length, px",
     "focal_range_px": "shortest and longest focal length, px",
+    "focal_range_in": "frames with these",
+    "named": "frames of this camera",
     "stand_in": "stand-ins for reliable frames",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
