@@ -79,7 +79,7 @@ def test_a_walk_with_a_pan_passes_and_the_pan_is_placed(tmp_path: Path, ingest: 
 
 
 def test_a_walk_whose_distant_views_share_one_wall_only_shows_depth(tmp_path: Path) -> None:
-    """Of two of six rooms, filmed with 24 frames, the pairs with the largest motion showed no depth."""
+    """In two rooms of six, filmed with 24 frames, the pairs with the largest motion showed no depth."""
     random = np.random.default_rng(0)
     wall = np.column_stack([random.uniform(-2, 6, 900), random.uniform(-1.2, 1.2, 900), np.full(900, 4.0)])
     things = np.column_stack([random.uniform(-1, 5, 300), random.uniform(-0.5, 0.5, 300), np.full(300, 2.0)])
