@@ -34,7 +34,7 @@ share of the pairs does. Observed: no pair of pans, zooms and flat scenes, a thi
 def pairs_with_depth(database: Path) -> tuple[int, int]:
     """Return the number of pairs in ``database`` that show depth, and of those that are judged.
 
-    Judged are each image's pairs with the smallest and the largest motion of `_MOVES`. Distant views of a walk
+    Judged are each image's pairs with the smallest and the largest motion of `_MOVES`. Far views of a walk
     often share one wall only: of six walks of 24 frames, two showed no depth in the pairs with large motion.
     """
     with pycolmap.Database.open(database) as opened:

@@ -42,7 +42,7 @@ from cleargs.capture.sfm_job import (
     Job,
     SfmOutcome,
 )
-from cleargs.capture.upright import find_up, stated_up
+from cleargs.capture.upright import find_up, stated_ups
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.media.image import image_size, lens_name, stated_focal
@@ -89,12 +89,7 @@ class Reconstruction:
 
     def turned_up(self, frames: Sequence[WorkFrame], reporter: Reporter) -> Reconstruction:
         """Return the reconstruction with up as `find_up` finds it. A guess is reported."""
-        files = {frame.image: frame.source for frame in frames}
-        stated = {
-            name: stated_up(source.path) if source.up is None and source.pts is None else source.up
-            for name, source in files.items()
-        }
-        up, told = find_up(self.model, {name: np.array(up) for name, up in stated.items() if up is not None})
+        up, told = find_up(self.model, stated_ups(frames))
         if told:
             reporter.info(told)
         if up is None:

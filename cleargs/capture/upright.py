@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.model import SparseModel
+from cleargs.capture.prepare import WorkFrame
 from cleargs.errors import InputError
+from cleargs.media.gopro import gravity
 from cleargs.safe_io import open_regular
 
 _PARALLEL = math.cos(math.radians(20))
@@ -46,6 +48,23 @@ def stated_up(image: Path) -> NDArray[np.float64] | None:  # [3]
     if not math.isfinite(pitch) or abs(found.get(b"Roll", 0.0)) > 10:
         return None
     return np.array([0.0, -math.cos(pitch), math.sin(pitch)])
+
+
+def stated_ups(frames: Sequence[WorkFrame]) -> dict[str, NDArray[np.float64]]:
+    """Return working image -> up in the axes of its camera, where a file of the input states it.
+
+    Such files are poses of an app, the XMP of a drone, and the video of a GoPro.
+    """
+    sources = {frame.image: frame.source for frame in frames}
+    found = {name: np.array(source.up) for name, source in sources.items() if source.up is not None}
+    for video in dict.fromkeys(source.path for source in sources.values() if source.pts is not None):
+        shown = {n: s.pts for n, s in sources.items() if s.path == video and s.pts is not None}
+        if (down := gravity(video, list(shown.values()))) is not None:
+            found = dict(zip(shown, -down, strict=True)) | found
+    for name, source in sources.items():
+        if source.pts is None and name not in found and (up := stated_up(source.path)) is not None:
+            found[name] = up
+    return found
 
 
 def find_up(
