@@ -27,6 +27,10 @@ _SIDEWAYS = 0.3, 0.9
 right axis lacks at most the first share of what the top lacks to 1, and the path is in a plane across the
 right axis: a walk turns about what is vertical."""
 _ACROSS = 0.9
+_LEVEL, _TILTED = (0.2, 0.3), math.cos(math.radians(25))
+"""The right axes of level cameras are horizontal. They tell up if they leave their plane by at most the first
+share of their smaller spread in it, and this is at least the second share of the larger one. They are used
+where the tops of the pictures are more than 25 degrees off: a drone that looks down, then ahead."""
 
 _HEAD = 2**18  # bytes at the start of a JPEG in which its XMP is
 _GIMBAL = re.compile(rb"Gimbal(Pitch|Roll)Degree(?:=\"|>)\s*([+-]?\d+(?:\.\d+)?)")
@@ -98,6 +102,13 @@ def find_up(
             None,
             f"all cameras look the same way: the tops of the pictures are treated as up (a guess; {_TURN})",
         )
+    plane, normals = np.linalg.svd(turns[:, 0], full_matrices=False)[1:]
+    level = plane[2] <= _LEVEL[0] * plane[1] and plane[1] >= _LEVEL[1] * plane[0]
+    top = -down / max(lengths[1], 1e-12)
+    if level and abs(normals[2] @ top) < _TILTED:
+        # Cameras look down rather than up, and the tops of some pictures are up.
+        up = normals[2] * np.sign(normals[2] @ (-down - ahead))
+        return up, f"up is across the left and right of the pictures (a guess; {_TURN})"
     flat = spread[2] < _FLAT * spread[0] and spread[1] > _FLAT * spread[0]
     across = flat and abs(axes[2] @ right) > _ACROSS * lengths[0]
     if across and lengths[1] <= _SIDEWAYS[1] and 1 - lengths[0] < _SIDEWAYS[0] * (1 - lengths[1]):
