@@ -53,6 +53,9 @@ from cleargs.safe_io import faults_as, read_json
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, where the farthest camera has distance 1."""
 
+LEAST_ELSEWHERE = 0.15
+"""Least share of the frames that fit each other, but not those that are placed, which is named."""
+
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
 
@@ -136,7 +139,15 @@ def reconstruct(
             alone.mkdir(exist_ok=True)
             job = job.model_copy(update={"folder": alone, "exif_images": [None] * len(job.exif_images)})
             model, outcome = _found(job, reporter, known)
-        _check_registered(len(model.images), len(frames), config, reporter)
+        if len(outcome.elsewhere) >= LEAST_ELSEWHERE * len(frames):
+            named = [frame.source.name for frame in frames if frame.image in set(outcome.elsewhere)]
+            reporter.warn(
+                f"{len(named)} frames ({named[0]} to {named[-1]}) fit each other, but not the "
+                f"{len(model.images)} frames that are placed, as after a cut to another place: "
+                "give each part alone (--start and --end, or --only)"
+            )
+        else:
+            _check_registered(len(model.images), len(frames), config, reporter)
         report_lens(model, frames, config, len(job.cameras), reporter)
         if outcome.shifts_px:
             reach = max(abs(shift) for pair in outcome.shifts_px.values() for shift in pair)

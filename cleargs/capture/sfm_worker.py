@@ -95,6 +95,8 @@ class Sfm(Features):
         self.used_database = self.database
         """The database with the features by which frames were placed."""
         self._torn_at: int | None = None
+        self._elsewhere: set[str] = set()
+        """Images of the second-largest model of the first mapping."""
         self._settled: tuple[pycolmap.Reconstruction, Path] | None = None
         """Model and database of the last call of `_rejoined`, if another call would find the same."""
         self.output = job.folder / "model.partial"
@@ -183,6 +185,7 @@ class Sfm(Features):
             method="sfm",
             lens=lens_of(model),
             torn_at=None if shifts else tried._torn_at,
+            elsewhere=sorted(tried._elsewhere - _names_in(model)),
             shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
             prediction=figure,
             predictions=figures,
@@ -403,7 +406,9 @@ class Sfm(Features):
                 hint="record more frames with more overlap and texture, "
                 "and move the camera rather than turn it",
             )
-        return max(models.values(), key=lambda model: model.num_reg_images())
+        first, *others = sorted(models.values(), key=lambda model: -model.num_reg_images())
+        self._elsewhere = _names_in(others[0]) if others else set()
+        return first
 
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
