@@ -15,7 +15,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cleargs.capture.adjustment import Adjuster
+from cleargs.capture.adjustment import Adjuster, lens_of, set_lens
+from cleargs.capture.camera_models import FIRST_LENS, FULL_LENS
 from cleargs.capture.cameras import MAX_ASPECT, MAX_FOCAL, MIN_FOCAL
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.motion import TWIST, projected
@@ -25,9 +26,11 @@ from cleargs.types import ArrayF64
 
 DOUBTFUL = 0.8
 """Share of the kept-out keypoints within `WITHIN_PX` below which other lenses are tried."""
-GAIN = 0.9
-"""A focal length per frame, or another kind of lens, is taken if it lowers the mean error of the kept-out
-keypoints to at most this share."""
+GAIN, ROUNDS = 0.9, 3
+"""A focal length per frame is taken if it lowers the median error of the kept-out keypoints to at most this
+share, another kind of lens if it lowers the mean error so; rounds of adjustment and triangulation. A focal
+length per frame changed the median by -1 to 2 % in eight rooms without a change, and by -31 % in one whose
+focal length breathes by 1.5 %; its mean changed by -9 %."""
 CAPPED_PX = 4.0
 """Largest error of a keypoint in the mean."""
 FOCAL_DOUBT, FOCAL_CHANGE, MIN_KEYPOINTS = 4.0, 1e-3, 30
@@ -75,9 +78,20 @@ class Fit:
 
     def error_of(self, model: pycolmap.Reconstruction) -> float:
         """Return the mean error, px, of this fit's kept-out keypoints by ``model``."""
+        return self._errors_of(model)[0]
+
+    def is_beaten_by(self, model: pycolmap.Reconstruction) -> bool:
+        """Return True if ``model`` lowers the median error of this fit's kept-out keypoints by `GAIN`.
+
+        Wrong matches, which no cameras explain, are a large part of the mean: it must not grow.
+        """
+        (mean, median), (before, middle) = self._errors_of(model), self._errors_of(self.judged)
+        return median <= GAIN * middle and mean <= before
+
+    def _errors_of(self, model: pycolmap.Reconstruction) -> tuple[float, float]:  # mean, median
         errors = prediction_errors(self.adjuster.tracks, model)
         known = np.minimum(errors[~np.isnan(errors)], CAPPED_PX)
-        return float(known.mean()) if len(known) else CAPPED_PX
+        return (float(known.mean()), float(np.median(known))) if len(known) else (CAPPED_PX, CAPPED_PX)
 
     @property
     def doubtful(self) -> bool:
@@ -126,7 +140,7 @@ def fitted(sfm: Steps, model: pycolmap.Reconstruction, like: Adjuster | None = N
     if not config.shared_camera or not _focal_length_changes(judged):
         return fit
     own = _with_lenses(sfm, fit, list(range(len(sfm.job.names))), "own-cameras")
-    if not own.model.points3D or fit.error_of(own.model) > GAIN * fit.error_of(judged):
+    if not own.model.points3D or not fit.is_beaten_by(own.model):
         return fit
     owners = lens_owners(own.model, len(sfm.job.names))
     if len(set(owners)) in (1, len(owners)):
@@ -146,8 +160,12 @@ def _with_lenses(sfm: Steps, fit: Fit, owners: list[int], name: str) -> Fit:
         camera_of=owners,
     )
     adjuster = Adjuster(other.used_database, other.with_points, fit.adjuster)
-    start = adjuster.triangulated(_with_cameras(fit.model, owners))
-    changed = adjuster.bundle_adjusted(start, cameras=True)
+    start = _with_cameras(fit.model, owners)
+    if sfm.job.config.camera_model == "auto" and lens_of(start) == FULL_LENS:
+        set_lens(start, FIRST_LENS)  # many terms explain a wrong focal length, and fit a frame alone poorly
+    changed = adjuster.triangulated(start)
+    for _ in range(ROUNDS):
+        changed = adjuster.bundle_adjusted(changed, cameras=True)
     return Fit(changed, adjuster, changed)
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -15,7 +18,7 @@ from pydantic import ValidationError
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.kept_out import all_tracks
-from cleargs.capture.lenses import is_impossible, lens_owners
+from cleargs.capture.lenses import Fit, is_impossible, lens_owners
 from cleargs.capture.prediction import prediction_errors, scales_differ
 from cleargs.capture.sfm import contradictions
 from cleargs.capture.sfm_job import Prediction, SfmOutcome
@@ -109,6 +112,24 @@ def test_a_change_of_lenses_gives_two_cameras(tmp_path: Path, ingest: Ingest) ->
     assert [row["named"] for row in rows] == ["view00.png to view06.png", "view07.png to view11.png"]
     np.testing.assert_allclose([row["focal_px"] for row in rows], [FOCAL, 1.8 * FOCAL], rtol=0.02)
     assert any("px in view07.png to view11.png" in text for text in done.warnings)
+
+
+def test_wrong_matches_do_not_hide_a_better_lens(tmp_path: Path) -> None:
+    """A focal length that breathes was not found: wrong matches are a large part of the mean error."""
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=8)
+    options.num_points3D, options.num_points2D_without_point3D = 300, 0
+    with pycolmap.Database.open(tmp_path / "matches.db") as opened:
+        right = pycolmap.synthesize_dataset(options, opened)
+    tracks, random = all_tracks(tmp_path / "matches.db"), np.random.default_rng(0)
+    wrong = np.isin(tracks.track, np.unique(tracks.track)[::4])
+    tracks = replace(tracks, xy=tracks.xy + wrong[:, None] * random.uniform(-40, 40, tracks.xy.shape))
+    judged = pycolmap.Reconstruction(right)
+    for camera in judged.cameras.values():
+        camera.params = [1.001 * camera.params[0], *camera.params[1:]]
+    fit = Fit(judged, cast(Any, SimpleNamespace(tracks=tracks)), judged)
+    assert fit.error_of(right) > 0.9 * fit.error_of(judged)
+    assert fit.is_beaten_by(right)
+    assert not Fit(right, fit.adjuster, right).is_beaten_by(judged)
 
 
 def test_frames_whose_focal_lengths_are_alike_share_a_lens() -> None:
