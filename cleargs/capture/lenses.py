@@ -45,8 +45,8 @@ START_FOCALS = (0.25, 0.3, 0.36, 0.43, 0.52, 0.62, 0.75, 0.9, 1.2, 1.8, 3.0)
 """Focal lengths, in long sides, that a search tries."""
 FISHEYE_AHEAD = 1.03
 """A fisheye is tried if this number of times as many matches fit one as fit a perspective lens."""
-SEARCHED_PAIRS, MIN_MATCHES, SEARCH_PX = 12, 60, 1.0
-"""Most pairs of frames of a search, fewest matches of a pair, and distance of a match that fits."""
+SEARCHED_PAIRS, MIN_MATCHES, MAX_MATCHES, SEARCH_PX = 12, 60, 250, 1.0
+"""Most pairs of frames of a search, fewest and most matches of a pair, and distance of a match that fits."""
 
 
 class Steps(Protocol):
@@ -287,4 +287,5 @@ def _pairs(database: Path) -> list[tuple[ArrayF64, ArrayF64]]:
         pixels = {
             key: np.asarray(opened.read_keypoints(key), np.float64)[:, :2] for pair in chosen for key in pair
         }
-    return [(pixels[one][rows[one, two][:, 0]], pixels[two][rows[one, two][:, 1]]) for one, two in chosen]
+    thin = {pair: rows[pair][:: -(-len(rows[pair]) // MAX_MATCHES)] for pair in chosen}
+    return [(pixels[one][thin[one, two][:, 0]], pixels[two][thin[one, two][:, 1]]) for one, two in chosen]
