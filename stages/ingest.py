@@ -55,7 +55,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
 FEW_FRAMES, GOOD_FRAMES = 20, 30
 """Number of frames below which a warning is given, and the number that it asks for."""
 
-VERSION = 23
+VERSION = 24
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -127,6 +127,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, rotate and reduce them, find poses or use the given ones, undistort and publish."""
     from cleargs.capture.choice import held_out, holdout_hash, select_sharp_frames
     from cleargs.capture.known_models import file_of
+    from cleargs.capture.lens_report import camera_rows
     from cleargs.capture.loose_points import in_scene
     from cleargs.capture.measuring import measure_motion, write_motion
     from cleargs.capture.prepare import prepare
@@ -197,7 +198,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             pose_convention=outcome.convention if capture.posed else None,
             kept_out_matches_off_px={name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
             kept_out=outcome.prediction and outcome.prediction.model_dump(),
-            cameras=scene.cameras(),
+            cameras=camera_rows(scene.model, frames),
             frames=len(frames),
             frames_available=capture.n_available,
             registered=len(model.images),

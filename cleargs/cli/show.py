@@ -49,6 +49,8 @@ LABELS: Mapping[str, str] = {
     "focal_px": "focal length, px",
     "focal_range_px": "shortest and longest focal length, px",
     "fallback": "frames in place of reliable ones",
+    "focal_range_in": "frames with these",
+    "named": "frames of this camera",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
     "bins_uncovered_before": "sections without a usable frame at first",
