@@ -22,7 +22,7 @@ from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.render.sidecars import stem, views_json, write_sidecars
-from cleargs.run_results import edited_scene, scene_path
+from cleargs.run_results import edited_scene, scene_origin, scene_path
 from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
@@ -109,7 +109,8 @@ def export_scene(
     if similarity:
         eyes = similarity["scale"] * eyes @ similarity["rotation"].T + similarity["translation"]
     files = dict(zip(outputs, kinds, strict=True))
-    source = f"scene of {stage}" if options.scene is None else str(options.scene)
+    origin = scene_origin(installed(), run, stage)
+    source = f"scene of {origin}" if options.scene is None else str(options.scene)
     written = _write(scene, files, options, f"{source}, {axes}", eyes)
     return [*messages, *cropped, *written]
 

@@ -448,9 +448,14 @@ def test_panoramas_alone_are_taken(tmp_path: Path, frames: Frames) -> None:
     assert len(open_capture(root, IngestConfig(only="*skybox*")).frames) == 6
 
 
-def test_pictures_of_many_bands_alone_are_refused_by_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bands", [True, False])
+def test_pictures_of_other_channels_alone_are_refused_by_name(tmp_path: Path, bands: bool) -> None:
+    """Spectral bands, and Lab: Pillow would take its numbers for colours."""
     for index in range(4):
-        apps.write_many_bands(tmp_path / f"{index}.tif")
+        if bands:
+            apps.write_many_bands(tmp_path / f"{index}.tif")
+        else:
+            Image.new("LAB", (32, 24)).save(tmp_path / f"{index}.tif")
     with pytest.raises(InputError, match="other channels than red, green and blue") as refused:
         open_capture(tmp_path, IngestConfig())
     assert "as JPEG or PNG" in str(refused.value.hint)
