@@ -177,7 +177,14 @@ class _Capture:
         found: Readout | None = None
         for _ in range(ROUNDS):
             readout = 0.0 if found is None else found.seconds
-            motions = {n: self._motion(n, readout, columns) for n in members if self._frames[n].two_sided}
+            # Without a readout they are the motions that were measured at the start.
+            motions = {
+                n: self.motions.get(self._frames[n].image)
+                if found is None
+                else self._motion(n, readout, columns)
+                for n in members
+                if self._frames[n].two_sided
+            }
             errors = [motion.error_px for motion in motions.values() if motion is not None]
             known = {n: motion for n, motion in motions.items() if motion is not None}
             if len(known) < MIN_FRAMES:
