@@ -128,6 +128,10 @@ class Batch:
         with opened_store(run.store) as store:
             return Planner(self.dag, run, store, usable_cores(), SilentReporter()).plan(self.until)
 
+    def stages(self, scene: SceneJob) -> tuple[str, ...]:
+        """Return the stages that have work with the settings of ``scene``: a draft makes no repairs."""
+        return self._run(scene).stages(self.dag)
+
     def run(self, scene: SceneJob, reporter: Reporter) -> None:
         """Run ``scene`` and the work after it, each in a separate process. Write their output to `log`."""
         self.log(scene).parent.mkdir(parents=True, exist_ok=True)

@@ -30,6 +30,7 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.session import DeviceChoice, resolve_device
 from cleargs.pipeline.stages import Stages
+from cleargs.report.formatting import count, duration
 from cleargs.types import Device
 
 
@@ -150,15 +151,16 @@ def _print_plans(batch: Batch, as_json: bool) -> None:
     total = {name: sum(plan[name] for plan in plans) for name in ("hours", "memory_gb", "disk_gb")}
     total["memory_gb"] = max(plan["memory_gb"] for plan in plans)  # the scenes run one after the other
     lines = []
-    for plan in [*plans, {"scene": "total", **total, "note": f"{len(plans)} scenes"}]:
-        cost = f"{plan['hours']:.2f} h, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
+    for plan in [*plans, {"scene": "total", **total, "note": count(len(plans), "scene")}]:
+        cost = f"{duration(3600 * plan['hours'])}, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
         lines.append(f"{plan['scene']}: {cost}; {plan['note']}")
     answer(as_json, {"folder": str(batch.folder), "device": batch.device, **total, "scenes": plans}, *lines)
 
 
 def _plan_json(batch: Batch, scene: SceneJob) -> dict[str, Any]:
     try:
-        plans = batch.plan(scene)
+        worked = batch.stages(scene)
+        plans = [plan for plan in batch.plan(scene) if plan.stage in worked]
         to_do = [plan.stage for plan in plans if plan.state != "done"]
         note = f"to do: {', '.join(to_do)}" if to_do else "done"
     except CleargsError as error:

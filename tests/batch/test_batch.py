@@ -205,7 +205,17 @@ def test_dry_run_shows_the_cost_and_summary_the_results(
         "barn": "waiting",
     }
     assert toys.run("--until", "count", "--dry-run") == 0
-    assert "attic: 0.00 h, 0.0 GB memory, 0.00 GB disk; done" in capsys.readouterr().out
+    assert "attic: 0.0 s, 0.0 GB memory, 0.00 GB disk; done" in capsys.readouterr().out
+
+
+def test_dry_run_names_no_stage_without_work(
+    toys: ToyBatch, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A draft has no repairs: "to do" listed rivr and consolidate."""
+    monkeypatch.setattr(type(toys.dag.load("total")), "idle", lambda stage, config: True, raising=False)
+    toys.write_sheet({"attic": ""})
+    assert toys.run("--dry-run") == 0
+    assert "disk; to do: count, square\n" in capsys.readouterr().out
 
 
 def test_a_figure_below_its_limit_is_a_failure(toys: ToyBatch, capsys: pytest.CaptureFixture[str]) -> None:
