@@ -111,7 +111,7 @@ def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = 
 
 
 def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | None:
-    """Remove motion blur, rolling shutter and defocus from a raw frame, as fitted by a trained scene.
+    """Remove motion blur, rolling shutter and defocus from a frame image, as fitted by a trained scene.
 
     Rolling shutter is removed only if the training detected it in the capture. ``stage`` is the stage that
     trained the scene (default: the last one that has a scene). Raises InputError if the frame has no pose.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.formation import Formation
     from cleargs.splat.scene import Scene
-    from cleargs.splat.trainer import Trained
+    from cleargs.splat.training import Trained
     from cleargs.splat.types import Render
     from cleargs.splat.views import TrainingView
 
@@ -103,6 +103,7 @@ def train(
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.state import load_state
     from cleargs.splat.trainer import Trainer
+    from cleargs.splat.training import run
 
     config = config or TrainConfig()
     if checkpoint is not None:
@@ -114,7 +115,8 @@ def train(
         if checkpoint is None:  # the interval is longer than any training: no checkpoint is written
             config = config.model_copy(update={"checkpoint_interval": 1_000_000})
         trainer = Trainer(scene, views, config, seed=(seed,), formation=formation, device=device)
-        return trainer.run(
+        return run(
+            trainer,
             checkpoint=Path(nowhere) / "none" if checkpoint is None else Path(checkpoint),
             reporter=reporter_of(progress),
         )

@@ -187,6 +187,15 @@ def self_test(
     return result
 
 
+class Machine(NamedTuple):
+    """Functions that tell about the GPU of a machine, by default of this one."""
+
+    obstacle: Callable[[], str | None] = cuda_obstacle
+    facts: Callable[[], dict[str, str]] = current_facts
+    cached_test: Callable[[dict[str, str]], SelfTest | None] = cached_test
+    self_test: Callable[[dict[str, str], Callable[[str], None]], SelfTest] = self_test
+
+
 def read_result(facts: dict[str, str], output: str) -> SelfTest:
     """Return the result in ``output``, the JSON lines that the child process printed."""
     result, running = SelfTest(facts, []), "start"

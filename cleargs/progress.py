@@ -114,18 +114,6 @@ class CountedTask:
         return max(0.0, 1.0 - share) / speed if speed else None
 
 
-class ForwardingTask(CountedTask):
-    """A task that forwards to another one, and calls ``show`` after each change."""
-
-    def __init__(self, task: Task, total: int | None, show: Show) -> None:
-        super().__init__(total, show)
-        self._task = task
-
-    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
-        self._task.update(done=done, note=note, share=share)
-        super().update(done=done, note=note, share=share)
-
-
 class BothTasks(CountedTask):
     """A task that forwards to two others, which so have the same estimate of the remaining time."""
 

@@ -41,6 +41,12 @@ def scene_stage(dag: Stages, run: Path, chosen: str | None) -> str:
     raise InputError(message, hint=f"see cleargs status {run}{others}")
 
 
+def scene_origin(dag: Stages, run: Path, stage: str) -> str:
+    """Return the stage that made the scene of ``stage``: a draft hands that of g0 on."""
+    earlier, worked = dag.names[: dag.names.index(stage) + 1], read_run_file(run, dag).stages(dag)
+    return next((name for name in reversed(earlier) if name in worked), stage)
+
+
 def check_results(dag: Stages, run: Path) -> None:
     """Raise StoreError if results in ``run`` are behind a link that the store did not make, or have one."""
     if read_pack(run) is not None:

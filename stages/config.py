@@ -39,7 +39,7 @@ def other_libraries(device: Device, config: object) -> Mapping[str, str]:
 
 
 class DistilConfig(FrozenModel):
-    """Joint distillation of raw frames and repairs. Settings that are missing here are those of [g0]."""
+    """Joint distillation of frame images and repairs. Settings that are missing here are those of [g0]."""
 
     steps: int | None = Field(
         None,

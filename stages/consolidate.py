@@ -1,4 +1,4 @@
-"""Full-Trajectory Repair Consolidation: a last training on raw frames and every frame's latest repair."""
+"""Full-Trajectory Repair Consolidation: a last training on frame images and every frame's latest repair."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .config import other_libraries as other_libraries
 
 
 class FinalDistilConfig(DistilConfig):
-    """Settings of the final distillation (training on raw frames and repairs)."""
+    """Settings of the final distillation (training on frame images and repairs)."""
 
     begin: float = Field(
         ROUNDS_END, ge=0, lt=1, description="start of this training in the schedule, as a fraction"
@@ -37,7 +37,7 @@ class ConsolidateConfig(FrozenModel):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 52
+VERSION = 53
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -82,7 +82,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
 
 
 def run(context: StageContext[ConsolidateConfig]) -> StageResult:
-    """Train RIVR's scene on raw frames and the latest accepted repairs, and check the result for harm."""
+    """Train RIVR's scene on frame images and the latest accepted repairs, and check the result for harm."""
     from cleargs.formation.measured import load_paths
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer

@@ -56,11 +56,12 @@ class IngestConfig(SfmConfig, CaptureConfig):
 FEW_FRAMES, GOOD_FRAMES = 20, 30
 """Number of frames below which a warning is given, and the number that it asks for."""
 
-VERSION = 22
+VERSION = 24
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
-OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "motion.parquet", "images", "colmap")
+TABLES = ("frames.parquet", "points.parquet", "observations.parquet", "motion.parquet")
+OUTPUTS = (*TABLES, "world.json", "images", "colmap")
 LEFTOVERS = ("images/*.png",)
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "pillow", "numpy", "scipy")
 
@@ -142,6 +143,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, rotate and reduce them, find poses or use the given ones, undistort and publish."""
     from cleargs.capture.choice import held_out, holdout_hash, select_sharp_frames
     from cleargs.capture.known_models import file_of
+    from cleargs.capture.lens_report import camera_rows
     from cleargs.capture.loose_points import in_scene
     from cleargs.capture.measuring import measure_motion, write_motion
     from cleargs.capture.prepare import prepare
@@ -207,6 +209,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         reporter.info(f"{0 if loose is None else len(loose.xyz)} points of the input start Gaussians")
     model = publish(frames, scene.model, outcome, test, work, context.out, config.max_size, reporter, loose)
     write_motion(context.out / "motion.parquet", frames, motion)
+    scene.similarity.write(context.out)
     return StageResult(
         missing=contradictions(outcome, config, reporter),
         summary=IngestSummary(
@@ -217,7 +220,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             pose_convention=outcome.convention if capture.posed else None,
             kept_out_matches_off_px={name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
             kept_out=outcome.prediction and outcome.prediction.model_dump(),
-            cameras=scene.cameras(),
+            cameras=camera_rows(scene.model, frames),
             frames=len(frames),
             frames_available=capture.n_available,
             registered=len(model.images),
@@ -228,7 +231,6 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             observations=sum(len(image.point_ids) for image in model.images.values()),
             mean_reprojection_error_px=round(float(model.error.mean()), 6),
             up="found" if scene.stood else "tops of the pictures",
-            similarity=scene.similarity.to_json(),
         ).figures()
         | motion.summary(),
     )

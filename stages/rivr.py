@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 AUTO_SHARE = 0.125
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 55
+VERSION = 56
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -100,8 +100,8 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import check_harm
-    from cleargs.rivr.need import frames_to_repair, rows_of_others
-    from cleargs.rivr.rounds import RepairContext, forget_others
+    from cleargs.rivr.need import frames_to_repair, untried_rows
+    from cleargs.rivr.rounds import RepairContext, forget_other_frames
     from cleargs.rivr.summaries import RivrSummary
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
@@ -117,7 +117,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         return _unchanged(context, supervision, g0)
     chosen = frames_to_repair(config.targets, supervision, g0.formations)
     targets = [supervision.views[frame_id] for frame_id in chosen]
-    forget_others(context.out, config.rounds, targets)
+    forget_other_frames(context.out, config.rounds, targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
     repairing = RepairContext(
@@ -129,14 +129,14 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         threads=threads,
     )
     reporter.info(f"RIVR: {len(targets)} of {len(supervision.views)} frames are tried")
-    others = rows_of_others(chosen, supervision, g0.formations)
+    others = untried_rows(chosen, supervision, g0.formations)
     rows, trainings, current = _repair_and_distil(context, supervision, targets, others, repairing, g0)
     write_selection(context.out / "selection.parquet", rows)
     made = len(rows) - len(others)
     if 2 * (refused := refused_repairs(rows)) > made:
         reporter.warn(
             f"{refused} of {made} repairs by {expert.name} were refused: they agree with neither the "
-            "raw frame nor the render (the report shows them); the renders replace them"
+            "frame image nor the render (the report shows them); the renders replace them"
         )
 
     repaired = any(row.accepted for row in rows)

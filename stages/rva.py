@@ -13,7 +13,7 @@ class RvaConfig(AssessmentConfig, EvaluatorConfig):
     """Reliability-aware View Allocation. The defaults are those of the paper, except `active_share`."""
 
 
-VERSION = 5
+VERSION = 6
 CONFIG = RvaConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -87,7 +87,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     )
     write_table(context.out / "bins.parquet", bins_table(frame_id, result), BINS)
     figures = summary(result, label(evaluator))
-    if figures["stand_in"]:
+    if figures["fallback"]:
         context.reporter.warn(
             "no frame is reliable; the best frames by R - B replace reliable frames in the geometric utility"
         )

@@ -1,8 +1,10 @@
 """Kill all five stages and ``gc`` many times, and check that the results are those of an undisturbed run.
 
 ``python tests/drill.py --kills 50`` uses a synthetic capture of eight tiny frames. The kills are divided
-equally among the stages and ``gc``. Each is a SIGKILL at a random moment. For every third kill, ``gc`` runs
-at the same time as the stage. Programs are forked from a process that has done all imports, which saves time.
+equally among the stages and ``gc``. Each is a SIGKILL at a random moment, every second one also to the
+children of the program. For every third kill, ``gc`` runs at the same time as the stage. The undisturbed run
+has two threads, and the others have one. Programs are forked from a process that has done all imports, which
+saves time.
 """
 
 from __future__ import annotations
@@ -49,10 +51,12 @@ class Drill:
     def run_folder(self) -> Path:
         return self.root / "run"
 
-    def run(self, folder: Path, *more: str) -> Program:
+    def run(self, folder: Path, *more: str, threads: int = 1) -> Program:
         settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value}")]
         arguments = ["run", str(self.root / "capture"), "-o", str(folder), "--workflow", "smoke"]
-        return Program([*arguments, "--no-report", "--threads", "1", *settings, *more], self.root / "log")
+        return Program(
+            [*arguments, "--no-report", "--threads", str(threads), *settings, *more], self.root / "log"
+        )
 
     def collect(self, *more: str) -> Program:
         arguments = ["gc", "--yes", "--store", str(self.run_folder / ".store"), *more]
@@ -66,12 +70,10 @@ class Drill:
         program = self.run(self.run_folder, "--until", stage)
         program.wait_for(f"{stage}: started")
         time.sleep(self.chance.uniform(0, seconds))
-        if self.kills[stage] % 3 == 0:
-            collector = self.collect()  # refused while the stage is running
-            self.kills[stage] += program.kill()
+        collector = self.collect() if self.kills[stage] % 3 == 0 else None  # refused while the stage runs
+        self.kills[stage] += program.kill(children=self.kills[stage] % 2 == 1)
+        if collector is not None:
             collector.wait_for_end()
-        else:
-            self.kills[stage] += program.kill()
         if not (self.run_folder / stage).is_symlink():
             return 1.2 * seconds
         (self.run_folder / stage).unlink()
@@ -126,11 +128,11 @@ class Program:
                 raise TimeoutError(f"{self.arguments} did not print {line!r}")
             time.sleep(0.01)
 
-    def kill(self) -> bool:
-        """Send SIGKILL to the program, but not to its children. Return False if it had ended before."""
+    def kill(self, *, children: bool = False) -> bool:
+        """Send SIGKILL to the program, and to its ``children``. Return False if it had ended before."""
         alive = not self.ended()
         if alive:
-            os.kill(self.pid, SIGKILL)
+            (os.killpg if children else os.kill)(self.pid, SIGKILL)
             self.code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         output = self.log.read_text()
         if "unexpected" in output or "Traceback" in output:
@@ -167,7 +169,7 @@ def drill(root: Path, kills: int, seed: int) -> dict[str, int]:
     synth = ["synth", str(root / "capture"), "--protocol", "mixed", "--frames", "8", "--size", "96x54"]
     # In a separate process, since this one forks and must have no threads.
     Program(synth, root / "log").succeed()
-    this.run(root / "undisturbed").succeed()
+    this.run(root / "undisturbed", threads=2).succeed()
     expected = digests(root / "undisturbed")
     shares = {name: kills // 6 + (number < kills % 6) for number, name in enumerate(this.kills)}
     for stage in STAGES:

@@ -46,7 +46,7 @@ def test_training_needs_no_capture_libraries() -> None:
     code = (
         "import sys; sys.modules.update({'pycolmap': None, 'OpenImageIO': None});"
         "import cleargs as cg; cg.train, cg.render_view, cg.save, cg.load, cg.Scene, cg.TrainingView;"
-        "import cleargs.splat.formats, cleargs.splat.trainer"
+        "import cleargs.splat.formats, cleargs.splat.training"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -1,4 +1,4 @@
-"""The shortest kill drill: one kill of each of the five stages and ``gc``."""
+"""A short kill drill: two kills of each of the five stages and ``gc``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DRILL = Path(__file__).with_name("drill.py")
 
 @pytest.mark.slow
 def test_what_was_killed_ends_with_the_same_digests() -> None:
-    done = subprocess.run([sys.executable, DRILL, "--kills", "6"], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, DRILL, "--kills", "12"], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    killed = "{'ingest': 1, 'rva': 1, 'g0': 1, 'rivr': 1, 'consolidate': 1, 'gc': 1}"
+    killed = "{'ingest': 2, 'rva': 2, 'g0': 2, 'rivr': 2, 'consolidate': 2, 'gc': 2}"
     assert done.stdout.splitlines()[-1].startswith(f"killed {killed}")

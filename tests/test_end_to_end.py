@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import random
-import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pyarrow as pa
@@ -36,7 +31,6 @@ SETTINGS = {
     "rivr.distil.steps": "20",
     "consolidate.distil.steps": "20",
 }
-KILLS_PER_STAGE = 2
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +50,6 @@ def finish(capture: Path, run: Path, *more: str) -> subprocess.CompletedProcess[
     done = subprocess.run(command(capture, run, *more), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done
-
-
-def digests(run: Path) -> dict[str, dict[str, str]]:
-    """Stage -> file -> digest, from the manifests."""
-    manifests = {stage: json.loads((run / stage / "manifest.json").read_text()) for stage in STAGES}
-    return {
-        stage: {name: record["digest"] for name, record in manifest["files"].items()}
-        for stage, manifest in manifests.items()
-    }
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +93,6 @@ def test_an_unknown_value_in_a_table_is_null_and_never_nan(finished: Path) -> No
                 assert not pc.any(pc.is_nan(column)).as_py(), (path, name)
 
 
-@pytest.mark.slow
-def test_one_thread_gives_the_same_digests(capture: Path, finished: Path, tmp_path: Path) -> None:
-    finish(capture, tmp_path / "run", "--threads", "1")
-    assert digests(tmp_path / "run") == digests(finished)
-
-
 def test_the_same_command_again_does_nothing(capture: Path, finished: Path) -> None:
     before = _times(finished)
     done = finish(capture, finished)
@@ -128,52 +107,8 @@ def test_a_setting_redoes_only_what_reads_it(capture: Path, finished: Path) -> N
     assert states == {**dict.fromkeys(STAGES, "done"), "consolidate": "outdated"}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stage", STAGES)
-def test_a_killed_stage_ends_with_the_same_digests(
-    stage: str, capture: Path, finished: Path, tmp_path: Path
-) -> None:
-    """kill -9 at random moments inside the stage, then the same command."""
-    run = tmp_path / "run"
-    _copy_before(stage, finished, run)
-    seconds = json.loads((finished / stage / "manifest.json").read_text())["seconds"]
-    moments = random.Random(stage)
-    for _ in range(KILLS_PER_STAGE):
-        _kill_inside(
-            command(capture, run, "--until", stage), f"{stage}: started", moments.uniform(0, seconds)
-        )
-    finish(capture, run, "--until", stage)
-    files = json.loads((run / stage / "manifest.json").read_text())["files"]
-    assert {name: record["digest"] for name, record in files.items()} == digests(finished)[stage]
-
-
-def _copy_before(stage: str, finished: Path, run: Path) -> None:
-    """Copy the finished run without the results of ``stage`` and of later stages."""
-    shutil.copytree(finished, run, symlinks=True)
-    for later in STAGES[STAGES.index(stage) :]:
-        (run / later).unlink()
-        shutil.rmtree(run / ".store" / later)
-        shutil.rmtree(run / ".store" / "kept" / later, ignore_errors=True)
-
-
 def _times(run: Path) -> dict[Path, int]:
     """Time of the last change of each file, except those that any run may write: locks, digests, the log."""
     ignored = (".lock", "digests.json", "run.log")
     files = (path for path in run.rglob("*") if path.is_file() and not path.name.startswith(ignored))
     return {path: path.stat().st_mtime_ns for path in files}
-
-
-def _kill_inside(arguments: list[str], start: str, delay: float) -> None:
-    """Start the command, wait for the line ``start`` and ``delay`` seconds, then kill its process group."""
-    with subprocess.Popen(
-        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith(start):
-                time.sleep(delay)
-                break
-        try:
-            os.killpg(process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            return  # it had ended before

@@ -105,7 +105,7 @@ def test_the_splatting_core_needs_no_capture_libraries() -> None:
     """Machines that only train have neither pycolmap nor OpenImageIO."""
     code = (
         "import sys; sys.modules.update({'pycolmap': None, 'OpenImageIO': None});"
-        "import cleargs.splat.trainer, cleargs.splat.render, cleargs.splat.ply, cleargs.splat.backend"
+        "import cleargs.splat.training, cleargs.splat.render, cleargs.splat.ply, cleargs.splat.backend"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

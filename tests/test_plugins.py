@@ -26,6 +26,7 @@ from cleargs.splat.formation import Formation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import run as run_training
 from cleargs.splat.views import TrainingView
 
 PARTS = Path(__file__).parents[1] / "examples" / "parts"
@@ -170,9 +171,8 @@ def test_densifier(parts: Path, tmp_path: Path) -> None:
     camera = Camera(48, 32, 40.0, 40.0, 24.0, 16.0, np.eye(4))
     image = np.full((32, 48, 3), 128, np.uint8)
     view = TrainingView(0, camera, 1.0, "real", lambda: (image, None))
-    trained = Trainer(scene, [view], config, seed=(0,)).run(
-        checkpoint=tmp_path / "c", reporter=SilentReporter()
-    )
+    trainer = Trainer(scene, [view], config, seed=(0,))
+    trained = run_training(trainer, checkpoint=tmp_path / "c", reporter=SilentReporter())
     assert trained.scene.gaussians.num == scene.gaussians.num // 2
     assert len(trained.rows) == 8
 

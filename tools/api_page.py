@@ -50,7 +50,7 @@ This page is made from the source: `python -m tools.api_page > docs/api.md`.
 """
 
 RETURNED = (
-    "cleargs.splat.trainer.Trained",
+    "cleargs.splat.training.Trained",
     "cleargs.splat.types.Render",
     "cleargs.scene.viewer.Deblurred",
     "cleargs.evaluate.eval_report.Evaluation",

@@ -21,7 +21,7 @@ from cleargs.types import ImageF32
 Distance = Callable[[ImageF32, ImageF32], float]
 
 RAW = "observed"
-"""Layer of the raw frame. If RIVR chooses it, the frame is not repaired."""
+"""Layer of the frame image. If RIVR chooses it, the frame is not repaired."""
 
 _MIN_ERROR = 1e-10
 """Minimum mean squared error: it limits the PSNR of equal images to 100 dB."""
@@ -34,7 +34,7 @@ class ChoiceRow(FrozenModel):
     frame_id: int
     chosen: str
     psnr: dict[str, float]
-    """Candidate -> PSNR in dB; includes the raw frame."""
+    """Candidate -> PSNR in dB; includes the frame image."""
     lpips: dict[str, float]
     """Candidate -> LPIPS; empty if its weights are not installed."""
 
@@ -156,7 +156,7 @@ def _psnr(image: ImageF32, truth: ImageF32) -> float:
 
 
 def _candidates(exr: Path, chosen: str) -> Mapping[str, ImageF32]:
-    """Return the candidates and the raw frame, sRGB."""
+    """Return the candidates and the frame image, sRGB."""
     layers = read_exr(exr).layers
     names = [name for name in ("render", "restored", "fused", RAW) if name in layers]
     return {name: from_layer(layers[name]) for name in dict.fromkeys((*names, chosen))}

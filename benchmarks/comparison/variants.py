@@ -35,7 +35,7 @@ _WEIGHT_ONE = (
 """Every active frame has weight 1."""
 
 _PLAIN_G0 = ("g0.formation.enabled=false",)
-"""Raw frames are compared with the sharp render, without image formation."""
+"""Frame images are compared with the sharp render, without image formation."""
 
 VARIANTS: tuple[Variant, ...] = (
     Variant("all-view", "all-view G0", "g0", ("rva.enabled=false", *_PLAIN_G0)),
@@ -89,7 +89,7 @@ QUESTIONS: tuple[tuple[str, str, str], ...] = (
     ("RIVR and consolidation, against RVA trained as long", WHOLE, "rva"),
     ("repairs, against the same distillation without them", WHOLE, "no-repairs"),
     ("consolidation, against as many steps of RIVR", WHOLE, "rivr"),
-    ("the raw frame before the expert, against the render", WHOLE, "rivr-no-observation"),
+    ("the frame image before the expert, against the render", WHOLE, "rivr-no-observation"),
     ("coverage compensation", "rva-paper", "rva-no-coverage"),
     ("graded weights, against binary ones of the same frames", "rva-paper", "rva-binary"),
     ("the fused candidate", "paper-open", "no-fused"),

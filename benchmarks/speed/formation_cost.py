@@ -21,9 +21,9 @@ from benchmarks.speed.benchmark_results import Machine, describe_machine
 from benchmarks.speed.iteration import WHOLE, Iteration, use_threads
 from benchmarks.speed.random_scenes import surface_scene
 from benchmarks.speed.timing import Quartiles, interleave, ratio
-from cleargs.formation.frame import FrameFormation, reach_of
+from cleargs.formation.formed import FormedView
+from cleargs.formation.frame import FrameFormation, displacement_of
 from cleargs.formation.motion import TWIST, FrameMotion
-from cleargs.formation.observed import FormedView
 from cleargs.formation.warp import displacement_fields, linear_curve, srgb_curve
 from cleargs.progress import Reporter
 from cleargs.splat.backend import backend_for, psnr, rasteriser_for
@@ -177,7 +177,7 @@ class _FormedStep(Iteration):
         super().__init__(gaussians, camera)
         depth = torch.from_numpy(_depth(self.engine, gaussians, camera))
         fields = displacement_fields(motion, camera, depth, torch.ones_like(depth))
-        frame = FrameFormation(0, motion, "blur", reach_px=reach_of(fields))
+        frame = FrameFormation(0, motion, "blur", displacement_px=displacement_of(fields))
         self._formed = FormedView(camera, 1.0, formation=frame)
 
     def image(self) -> Tensor:

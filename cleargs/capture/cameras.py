@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,18 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.capture.camera_models import MODELS
 from cleargs.errors import InputError
+from cleargs.files import write_json
 from cleargs.media import MAX_PIXELS
+from cleargs.safe_io import FAULTS, read_json
 
 if TYPE_CHECKING:
     from cleargs.capture.colmap import pycolmap
 
 MAX_ASPECT, MIN_FOCAL, MAX_FOCAL = 1.1, 0.3, 5.0
 """Largest ratio of fx and fy, and range of the focal length in long sides, of a lens that is believed."""
+
+WORLD = "world.json"
+"""File of ingest with the similarity from its world to that of the input."""
 
 MAX_PARAMETER, SHORTEST_FOCAL = 1e9, 1e-3
 """Largest camera parameter, and shortest focal length in pixels. Beyond them pixels and rays overflow."""
@@ -210,22 +215,21 @@ class Similarity:
         origin = self.origin + self.scale * self.rotation.T @ after.origin
         return Similarity(after.rotation @ self.rotation, origin, self.scale * after.scale)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the similarity back to the input's world, for ``manifest.json``."""
-        return {
-            "definition": "x_input = scale * rotation @ x_normalised + translation",
-            "scale": self.scale,
-            "rotation": self.rotation.T.tolist(),
-            "translation": self.origin.tolist(),
-        }
+    def write(self, ingest: Path) -> None:
+        """Write the similarity back to the input's world into a folder of ingest."""
+        definition = "x_input = scale * rotation @ x_normalised + translation"
+        numbers = {"rotation": self.rotation.T.tolist(), "translation": self.origin.tolist()}
+        write_json(ingest / WORLD, {"definition": definition, "scale": self.scale, **numbers})
 
     @staticmethod
-    def from_json(noted: Any, ingest: Path) -> Similarity:
-        """Return the similarity that `to_json` wrote into the manifest of ``ingest``, or raise InputError."""
+    def read(ingest: Path) -> Similarity:
+        """Return the similarity that `write` wrote into a folder of ingest, or raise InputError."""
         try:
-            rotation, origin = (np.array(noted[name], np.float64) for name in ("rotation", "translation"))
+            noted = read_json(ingest / WORLD, root=ingest)
+            rotation = np.array(noted["rotation"], np.float64).reshape(3, 3)
+            origin = np.array(noted["translation"], np.float64).reshape(3)
             return Similarity(rotation.T, origin, float(noted["scale"]))
-        except (KeyError, TypeError, ValueError) as error:
+        except FAULTS as error:
             raise InputError(
                 f"{ingest} does not say how it was normalised", hint="run that stage with --force"
             ) from error

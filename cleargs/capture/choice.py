@@ -22,6 +22,8 @@ from cleargs.progress import Reporter
 from cleargs.types import ImageU8
 
 _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
+_FOLLOWED_S = 0.1
+"""Time between the frames of a video in which the motion of the picture is followed."""
 
 
 def select_sharp_frames(
@@ -52,14 +54,17 @@ def _sharpest_of(
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, timeline.pts)
     if len(nearest) == len(times):
         return frames
-    values, pace, seen = np.full(len(nearest), -1.0), Pace(), []
+    values, pace, followed = np.full(len(nearest), -1.0), Pace(), list[int]()
+    between = (timeline.seconds(len(nearest) - 1) - timeline.seconds(0)) / (len(nearest) - 1)
+    every = max(1, round(_FOLLOWED_S / max(between, 1e-6)))
     numbers = {pts: number for number, pts in enumerate(timeline.pts)}
     with reporter.task("looking for sharp frames", len(numbers)) as task:
         for pts, grey in decode_grey(video, numbers):
-            seen.append(numbers[pts])
             picture = reduced(grey, long_side)
-            values[seen[-1]] = sharpness(picture)
-            pace.add(picture)
+            values[numbers[pts]] = sharpness(picture)
+            if by_motion and (not followed or numbers[pts] >= followed[-1] + every):
+                followed.append(numbers[pts])
+                pace.add(picture)
             task.advance()
     stretches = [np.flatnonzero(nearest == place) for place in range(len(times))]
     if any((values[stretch] < 0.0).all() for stretch in stretches):
@@ -68,7 +73,7 @@ def _sharpest_of(
             hint="convert the video with ffmpeg, or cut the damaged part off",
         )
     if by_motion:
-        distances = np.interp(np.arange(len(nearest)), seen, pace.distances())
+        distances = np.interp(np.arange(len(nearest)), followed, pace.distances())
         places = even_places(
             distances, np.array([numbers[frame.pts] for frame in frames if frame.pts is not None])
         )

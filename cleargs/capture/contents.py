@@ -40,6 +40,7 @@ from cleargs.capture.folders import (
     natural_key,
     unmasked,
 )
+from cleargs.capture.pairs import second_views
 from cleargs.digest import files_under
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
@@ -68,6 +69,7 @@ PREVIEWS, COPIES, OUTSIDE = (
 )
 BROKEN = "file%s that cannot be opened"
 EXR, EXR_SUFFIX = "EXR picture%s, depth or rendered layers", ".exr"
+VIEWS = "second picture%s of the same views"
 OTHERS = "picture%s of captures with poses in folders below"
 SPOT = "picture%s of panoramas from one spot"
 DEEP_TIFF = "TIFF picture%s of one channel, depth or a spectral band"
@@ -79,6 +81,7 @@ _HINTS = {
     VIDEOS: "photographs are taken; for the videos, give one as the input, or set --skip for the photographs",
     BELOW: "give their folder, or put all videos into one folder",
     BROKEN: "they are broken links or devices: put the files themselves in their places",
+    VIEWS: "those as filmed are taken; --only and --skip choose, by the name of the folder",
     ALONE: "name masks like their photographs",
     SPOT: "--only takes them; pictures that only turn show no depth",
     SPECTRAL: "export red, green and blue as JPEG or PNG",
@@ -174,6 +177,8 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     videos = [path for path in wanted if path.suffix.lower() in VIDEO_SUFFIXES]
     small, copies = _small_videos(videos, root), _second_videos(videos)
     videos = _without(videos, [*small, *copies])
+    second_clips = second_views(videos, root)
+    videos = _without(videos, second_clips)
     top = [path for path in videos if path.parent == root] or videos
     left_out[BELOW] = _without(videos, top)
     videos = sorted(top, key=lambda path: natural_key(path.relative_to(root).as_posix()))
@@ -213,6 +218,9 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     products = [path for path in images if PRODUCT_NAME.fullmatch(path.stem)]
     left_out[PRODUCTS] = products if len(products) <= _FEW * (len(images) - len(products)) else []
     images = _without(images, left_out[PRODUCTS])
+    views = second_views(images, root)
+    left_out[VIEWS] = [*second_clips, *views]
+    images = _without(images, views)
     second = _copies(images, headers)
     left_out[COPIES] = [*second, *copies, *_without(raw, left_out[RAW])]
     images = _without(images, second)

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
+from cleargs.capture.pairs import version_rank
 from cleargs.digest import files_under, has_results
 from cleargs.errors import InputError, listed
 from cleargs.media import IMAGE_SUFFIXES
@@ -47,6 +48,7 @@ def folders_to_search(root: Path) -> list[Path]:
     """Return the folders with images: ``images/``, its reductions, others except ``masks/``, and ``root``."""
     others = sorted(path for path in root.iterdir() if path.is_dir() and is_inside(path.name))
     others = [path for path in others if not has_results(path)]
+    others.sort(key=lambda path: version_rank(path.name))  # those as filmed before sharp ones
     folders = dict.fromkeys([*image_folders(root), *others, root])
     folders.pop(root / "masks", None)
     return [folder for folder in folders if image_files(folder, below=folder != root)]

@@ -127,8 +127,10 @@ def scales_differ(tracks: Tracks, model: pycolmap.Reconstruction, start: int) ->
     if join is None:
         return False
     joint = model.images[join].projection_center()
+    before, after = placed & (tracks.image < start), placed & (tracks.image >= start)
+    across = np.isin(tracks.track, np.intersect1d(tracks.track[before], tracks.track[after]))
     found: list[dict[int, float]] = []
-    for among in (placed & (tracks.image < start), placed & (tracks.image >= start)):
+    for among in (before & across, after & across):
         used, number = _several(tracks, among)
         if not len(used):
             return False

@@ -188,32 +188,32 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, still: MaskU8 | Non
                 hint="give the images that the poses were made from, or set ingest.poses=sfm",
             )
         camera = camera.resized(width, height)
-    stencil = read_stencil(frame)
+    source_mask = read_source_mask(frame)
     still = still if still is not None and still.shape == (height, width) else None
-    masked = stencil is not None or still is not None
+    masked = source_mask is not None or still is not None
     if masked:
-        write_mask(mask, _stencilled(frame, stencil, still, width, height))
-    transparent = stencil is not None and frame.mask is None
+        write_mask(mask, _resized_mask(frame, source_mask, still, width, height))
+    transparent = source_mask is not None and frame.mask is None
     return WorkFrame(frame, image.name, width, height, masked, camera, transparent)
 
 
-def _stencilled(
-    frame: SourceFrame, stencil: MaskU8 | None, still: MaskU8 | None, width: int, height: int
+def _resized_mask(
+    frame: SourceFrame, source_mask: MaskU8 | None, still: MaskU8 | None, width: int, height: int
 ) -> MaskU8:  # [height, width]
     """Return the mask of a working image: 0 where its own mask or that of still parts is 0."""
     mask = np.full((height, width), 255, np.uint8) if still is None else still
-    if stencil is None:
+    if source_mask is None:
         return mask
     # Rounded to whole pixels, a mask of one pixel has any proportions.
-    coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
-    if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
+    coarse = _COARSEST_MASK * min(source_mask.shape) < min(width, height)
+    if coarse or not _alike(source_mask.shape[1], source_mask.shape[0], (width, height)):
         what = "is far smaller than it" if coarse else "does not have its proportions"
         raise InputError(f"the mask of {frame.name} {what}", hint="make masks of the size of their images")
-    own = np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST))
+    own = np.asarray(cv2.resize(source_mask, (width, height), interpolation=cv2.INTER_NEAREST))
     return np.minimum(mask, own)
 
 
-def read_stencil(frame: SourceFrame) -> MaskU8 | None:
+def read_source_mask(frame: SourceFrame) -> MaskU8 | None:
     """Return the mask of the frame, else the transparency of its image; None if all pixels count."""
     if frame.mask is not None:
         return read_mask(frame.mask, _turn_of_mask(frame, frame.mask))

@@ -7,13 +7,11 @@ itself runs in `cleargs.capture.sfm_worker`, a child process.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -21,9 +19,6 @@ from cleargs.capture import known_models
 from cleargs.capture.camera_models import FIRST_LENS, SfmModel
 from cleargs.capture.cameras import (
     COLMAPS_GUESS,
-    MAX_ASPECT,
-    MAX_FOCAL,
-    MIN_FOCAL,
     Intrinsics,
     Pose,
     Similarity,
@@ -34,6 +29,7 @@ from cleargs.capture.cameras import (
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.database import is_sound, remove_database
+from cleargs.capture.lens_report import report_lens
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import (
@@ -46,7 +42,7 @@ from cleargs.capture.sfm_job import (
     Job,
     SfmOutcome,
 )
-from cleargs.capture.upright import find_up, stated_up
+from cleargs.capture.upright import find_up, stated_ups
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.media.image import image_size, lens_name, stated_focal
@@ -54,11 +50,11 @@ from cleargs.media.video import video_size
 from cleargs.progress import Reporter
 from cleargs.safe_io import faults_as, read_json
 
-JUMP = 0.05
-"""Change of the logarithm of the focal length from one frame to the next that is named."""
-
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, where the farthest camera has distance 1."""
+
+LEAST_ELSEWHERE = 0.15
+"""Least share of the frames that fit each other, but not those that are placed, which is named."""
 
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
@@ -96,12 +92,7 @@ class Reconstruction:
 
     def turned_up(self, frames: Sequence[WorkFrame], reporter: Reporter) -> Reconstruction:
         """Return the reconstruction with up as `find_up` finds it. A guess is reported."""
-        files = {frame.image: frame.source for frame in frames}
-        stated = {
-            name: stated_up(source.path) if source.up is None and source.pts is None else source.up
-            for name, source in files.items()
-        }
-        up, told = find_up(self.model, {name: np.array(up) for name, up in stated.items() if up is not None})
+        up, told = find_up(self.model, stated_ups(frames))
         if told:
             reporter.info(told)
         if up is None:
@@ -109,24 +100,6 @@ class Reconstruction:
         turn = Similarity(upright(up), np.zeros(3), 1.0)
         turned = self.model.moved(turn)
         return replace(self, model=turned, similarity=self.similarity.then(turn), stood=True)
-
-    def cameras(self) -> list[dict[str, Any]]:
-        """Return lens, mean focal length (px) and number of frames of each camera.
-
-        If each frame has its own, they are one row, with the median and the range of the focal lengths.
-        """
-        frames = Counter(image.camera_id for image in self.model.images.values())
-        used = [self.model.cameras[key] for key in frames]
-        if len(frames) > 1 and max(frames.values()) == 1 and len({camera.model for camera in used}) == 1:
-            focal = np.array([sum(camera.focal) / 2 for camera in used]).round(3)
-            row = {"lens": used[0].model, "focal_px": round(float(np.median(focal)), 3), "frames": len(used)}
-            ends = [float(focal.min()), float(focal.max())]
-            return [row if ends[0] == ends[1] else {**row, "focal_range_px": ends}]
-        return [
-            {"lens": camera.model, "focal_px": round(sum(camera.focal) / 2, 3), "frames": frames[key]}
-            for key, camera in self.model.cameras.items()
-            if frames[key]
-        ]
 
 
 def reconstruct(
@@ -166,8 +139,16 @@ def reconstruct(
             alone.mkdir(exist_ok=True)
             job = job.model_copy(update={"folder": alone, "exif_images": [None] * len(job.exif_images)})
             model, outcome = _found(job, reporter, known)
-        _check_registered(len(model.images), len(frames), config, reporter)
-        _report_lens(model, frames, config, reporter)
+        if len(outcome.elsewhere) >= LEAST_ELSEWHERE * len(frames):
+            named = [frame.source.name for frame in frames if frame.image in set(outcome.elsewhere)]
+            reporter.warn(
+                f"{len(named)} frames ({named[0]} to {named[-1]}) fit each other, but not the "
+                f"{len(model.images)} frames that are placed, as after a cut to another place: "
+                "give each part alone (--start and --end, or --only)"
+            )
+        else:
+            _check_registered(len(model.images), len(frames), config, reporter)
+        report_lens(model, frames, config, len(job.cameras), reporter)
         if outcome.shifts_px:
             reach = max(abs(shift) for pair in outcome.shifts_px.values() for shift in pair)
             reporter.warn(
@@ -215,37 +196,6 @@ def reconstruct(
     if adopted is not None and len(adopted.error) and not stale and outcome.method == "given":
         model = adopted
     return Reconstruction(model, worlds[outcome.convention][0], outcome)
-
-
-def _report_lens(
-    model: SparseModel, frames: Sequence[WorkFrame], config: SfmConfig, reporter: Reporter
-) -> None:
-    """Say which frames a focal length that changes is shortest and longest in, and warn of a strange lens."""
-    lenses = [model.cameras[key] for key in sorted({image.camera_id for image in model.images.values()})]
-    ratios = [max(lens.focal) / min(lens.focal) for lens in lenses]
-    shares = [sum(lens.focal) / 2 / max(lens.width, lens.height) for lens in lenses]
-    usual = config.focal is not None or MIN_FOCAL <= min(shares) <= max(shares) <= MAX_FOCAL
-    if max(ratios) > MAX_ASPECT or not usual:
-        lens = lenses[int(np.argmax(ratios))] if max(ratios) > MAX_ASPECT else lenses[0]
-        fx, fy = lens.focal
-        reporter.warn(
-            f"almost no lens is like this one: focal lengths {fx:.0f} and {fy:.0f} px for images of "
-            f"{lens.width}x{lens.height}; state the lens (ingest.focal, ingest.camera_model)"
-        )
-    if config.shared_camera and len(lenses) == len(model.images) > 1 and min(shares) < max(shares):
-        named = {frame.image: frame.source.name for frame in frames}
-        focal = {
-            named[image.name]: sum(model.cameras[image.camera_id].focal) / 2
-            for image in model.images.values()
-        }
-        short, long = (choice(focal, key=lambda name: focal[name]) for choice in (min, max))
-        names = list(focal)
-        jumps = [two for one, two in pairwise(names) if abs(np.log(focal[two] / focal[one])) > JUMP]
-        at = f", with jumps at {', '.join(jumps[:5])}" if jumps else ""
-        reporter.warn(
-            f"the focal length changes from frame to frame: {focal[short]:.0f} px in {short}, "
-            f"{focal[long]:.0f} px in {long}{at}; each frame has its own camera"
-        )
 
 
 def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -> tuple[str, ...]:

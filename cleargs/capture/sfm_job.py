@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -84,5 +84,7 @@ class SfmOutcome(FrozenModel):
     """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
     shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)
     """Working image -> shift of its picture by a stabiliser, px; empty: none was found."""
+    elsewhere: Sequence[str] = ()
+    """Working images without a pose that fit each other, as after a cut to another place."""
     torn_at: int | None = None
     """Number of the first frame after a join that matches contradict (`weakest_join`); None: no such join."""

@@ -94,7 +94,8 @@ class Sfm(Features):
         super().__init__(job, report)
         self.used_database = self.database
         """The database with the features by which frames were placed."""
-        self._torn_at: int | None = None
+        self._elsewhere: set[str] = set()
+        """Images of the second-largest model of the first mapping."""
         self._settled: tuple[pycolmap.Reconstruction, Path] | None = None
         """Model and database of the last call of `_rejoined`, if another call would find the same."""
         self.output = job.folder / "model.partial"
@@ -178,11 +179,14 @@ class Sfm(Features):
         model, shifts = steadied(fit.model, adjust_all)
         # The kept-out tracks have no shift, so they say nothing about the cameras of a stabilised video.
         figure, figures = (None, {}) if shifts else fit.predictions()
+        join, _ = weakest_join(model, tried.used_database)
+        torn = not shifts and scales_differ(all_tracks(tried.used_database), model, join)
         outcome = SfmOutcome(
             placed=placed,
             method="sfm",
             lens=lens_of(model),
-            torn_at=None if shifts else tried._torn_at,
+            torn_at=join - 1 if torn else None,
+            elsewhere=sorted(tried._elsewhere - _names_in(model)),
             shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
             prediction=figure,
             predictions=figures,
@@ -367,8 +371,6 @@ class Sfm(Features):
                 self._settled = model, database
                 break
             model, image, share = found, again, better
-        torn = share < _JOINED and scales_differ(all_tracks(database), model, image)
-        self._torn_at = image - 1 if torn else None
         return model
 
     def _map(self) -> pycolmap.Reconstruction:
@@ -403,7 +405,9 @@ class Sfm(Features):
                 hint="record more frames with more overlap and texture, "
                 "and move the camera rather than turn it",
             )
-        return max(models.values(), key=lambda model: model.num_reg_images())
+        first, *others = sorted(models.values(), key=lambda model: -model.num_reg_images())
+        self._elsewhere = _names_in(others[0]) if others else set()
+        return first
 
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import field_validator
-
 from cleargs.manifest import Summary
 
 
@@ -37,11 +35,3 @@ class IngestSummary(Summary):
     observations: int | None = None
     mean_reprojection_error_px: float | None = None
     up: str | None = None
-    similarity: dict[str, Any] | None = None
-    """From the world of the input to that of the run, see `cleargs.capture.cameras.Similarity`."""
-
-    @field_validator("poses", mode="before")
-    @classmethod
-    def _of_older_versions(cls, poses: object) -> object:
-        former = {"input": "given", "refined": "adjusted"}
-        return former.get(poses, poses) if isinstance(poses, str) else poses

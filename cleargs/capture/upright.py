@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.model import SparseModel
+from cleargs.capture.prepare import WorkFrame
 from cleargs.errors import InputError
+from cleargs.media.gopro import gravity
 from cleargs.safe_io import open_regular
 
 _PARALLEL = math.cos(math.radians(20))
@@ -25,6 +27,10 @@ _SIDEWAYS = 0.3, 0.9
 right axis lacks at most the first share of what the top lacks to 1, and the path is in a plane across the
 right axis: a walk turns about what is vertical."""
 _ACROSS = 0.9
+_LEVEL, _TILTED = (0.2, 0.3), math.cos(math.radians(25))
+"""The right axes of level cameras are horizontal. They tell up if they leave their plane by at most the first
+share of their smaller spread in it, and this is at least the second share of the larger one. They are used
+where the tops of the pictures are more than 25 degrees off: a drone that looks down, then ahead."""
 
 _HEAD = 2**18  # bytes at the start of a JPEG in which its XMP is
 _GIMBAL = re.compile(rb"Gimbal(Pitch|Roll)Degree(?:=\"|>)\s*([+-]?\d+(?:\.\d+)?)")
@@ -46,6 +52,23 @@ def stated_up(image: Path) -> NDArray[np.float64] | None:  # [3]
     if not math.isfinite(pitch) or abs(found.get(b"Roll", 0.0)) > 10:
         return None
     return np.array([0.0, -math.cos(pitch), math.sin(pitch)])
+
+
+def stated_ups(frames: Sequence[WorkFrame]) -> dict[str, NDArray[np.float64]]:
+    """Return working image -> up in the axes of its camera, where a file of the input states it.
+
+    Such files are poses of an app, the XMP of a drone, and the video of a GoPro.
+    """
+    sources = {frame.image: frame.source for frame in frames}
+    found = {name: np.array(source.up) for name, source in sources.items() if source.up is not None}
+    for video in dict.fromkeys(source.path for source in sources.values() if source.pts is not None):
+        shown = {n: s.pts for n, s in sources.items() if s.path == video and s.pts is not None}
+        if (down := gravity(video, list(shown.values()))) is not None:
+            found = dict(zip(shown, -down, strict=True)) | found
+    for name, source in sources.items():
+        if source.pts is None and name not in found and (up := stated_up(source.path)) is not None:
+            found[name] = up
+    return found
 
 
 def find_up(
@@ -79,6 +102,13 @@ def find_up(
             None,
             f"all cameras look the same way: the tops of the pictures are treated as up (a guess; {_TURN})",
         )
+    plane, normals = np.linalg.svd(turns[:, 0], full_matrices=False)[1:]
+    level = plane[2] <= _LEVEL[0] * plane[1] and plane[1] >= _LEVEL[1] * plane[0]
+    top = -down / max(lengths[1], 1e-12)
+    if level and abs(normals[2] @ top) < _TILTED:
+        # Cameras look down rather than up, and the tops of some pictures are up.
+        up = normals[2] * np.sign(normals[2] @ (-down - ahead))
+        return up, f"up is across the left and right of the pictures (a guess; {_TURN})"
     flat = spread[2] < _FLAT * spread[0] and spread[1] > _FLAT * spread[0]
     across = flat and abs(axes[2] @ right) > _ACROSS * lengths[0]
     if across and lengths[1] <= _SIDEWAYS[1] and 1 - lengths[0] < _SIDEWAYS[0] * (1 - lengths[1]):

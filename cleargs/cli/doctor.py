@@ -12,9 +12,9 @@ from typing import Literal, NamedTuple
 import click
 
 import cleargs
-from cleargs import gpu
 from cleargs.cli.common import answer, json_option
 from cleargs.cli.user_config import user_config_file
+from cleargs.gpu import Machine
 from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import usable_cores
 from cleargs.plugins import installed_version
@@ -51,7 +51,7 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
     FOLDER is the folder for runs. The exit code is 1 if a run would fail on this machine.
     """
     config = user_config_file()
-    device, report = _device(wants_test)
+    device, report = device_of(Machine(), wants_test)
     findings = [
         Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
         *(_library(name) for name in LIBRARIES),
@@ -69,15 +69,15 @@ def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
     return 1 if any(finding.state == "bad" for finding in findings) else 0
 
 
-def _device(wants_test: bool) -> tuple[Finding, list[str]]:
+def device_of(machine: Machine, wants_test: bool) -> tuple[Finding, list[str]]:
     """Return the device that ``--device auto`` chooses, and the lines of the self-test if ``wants_test``."""
-    if (obstacle := gpu.cuda_obstacle()) is not None:
+    if (obstacle := machine.obstacle()) is not None:
         return Finding("device", "bad" if wants_test else "ok", f"cpu ({obstacle})"), []
-    facts, report = gpu.current_facts(), []
+    facts, report = machine.facts(), []
     if wants_test:
-        tested = gpu.self_test(facts, lambda line: click.echo(line, err=True))
+        tested = machine.self_test(facts, lambda line: click.echo(line, err=True))
         report = ["", *tested.lines()]
-    elif (found := gpu.cached_test(facts)) is not None:
+    elif (found := machine.cached_test(facts)) is not None:
         tested = found
     else:
         return Finding("device", "note", "cpu (the GPU is not tested yet: cleargs doctor --gpu)"), []

@@ -331,8 +331,8 @@ def _regions(evaluation: Evaluation) -> list[str]:
     plain, aligned = evaluation.means.get("psnr"), evaluation.psnr_colour_aligned
     if plain is not None and aligned is not None and aligned - plain > EXPOSURES_DIFFER:
         lines.append(f"exposures differ: {aligned:.2f} dB with aligned colours (--align-colour)")
-    if evaluation.psnr_as_filmed is not None:
-        lines.append(f"as the camera took the frames: {evaluation.psnr_as_filmed:.2f} dB")
+    if evaluation.psnr_formed is not None:
+        lines.append(f"as the camera took the frames: {evaluation.psnr_formed:.2f} dB")
     if evaluation.covered is not None:
         lines.append(f"behind Gaussians in front of the true surface: {evaluation.covered:.1%} of the pixels")
     return lines

@@ -24,7 +24,7 @@ from cleargs.report.report_json import ENTRY, FOLDER, linked_manifests
 from cleargs.report.single_file import for_others
 from cleargs.run_results import scene_stage
 
-KEPT = ("manifest.json", "*.parquet", "colmap/**/*")
+KEPT = ("manifest.json", "world.json", "*.parquet", "colmap/**/*")
 """Files of every stage that go into the pack."""
 
 MADE_OF_NAMES = re.compile(r'^(input = ").*/(.*")$|^store = .*\n', re.MULTILINE)

@@ -22,7 +22,7 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.pipeline.session import DeviceChoice, resolve_device
 from cleargs.pipeline.stages import Stages
 from cleargs.report.formatting import count as count_of
-from cleargs.run_results import scene_stage
+from cleargs.run_results import scene_origin, scene_stage
 
 
 @click.command(
@@ -127,8 +127,9 @@ def render(
     camera = shots[0].camera
     width = camera.width * (2 if given.side_by_side else 1)
     facts = {"file": str(output), "stage": stage, "pictures": len(shots)}
+    origin = stage if run.is_file() else scene_origin(dag, run, stage)
     answer(
         as_json,
         {**facts, "width": width, "height": camera.height},
-        f"{output}: {count_of(len(shots), 'picture')} of {width}x{camera.height}, scene of {stage}",
+        f"{output}: {count_of(len(shots), 'picture')} of {width}x{camera.height}, scene of {origin}",
     )

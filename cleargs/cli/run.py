@@ -196,7 +196,8 @@ def run(
             made = outcome.manifest
             cost = f"{made.seconds:.1f} s, {made.peak_memory_gb or 0:.2f} GB memory"
             log(f"{outcome.stage}: {outcome.how}, {cost}, key {made.key}")
-        lines = outcome_lines(outcomes, folder, page and settings.folder / ENTRY)
+        worked = [outcome for outcome in outcomes if outcome.stage in settings.stages(dag)]
+        lines = outcome_lines(worked, folder, page and settings.folder / ENTRY)
         for line in lines:
             context.meta[LOG](line)
     if as_json:

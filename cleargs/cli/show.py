@@ -34,7 +34,7 @@ from cleargs.pipeline.stages import Stages
 from cleargs.report.report_json import linked_manifests
 
 MAX_LISTED = 16  # items of a list that are printed
-HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures that only programs need
+HIDDEN = frozenset({"holdout_hash", "round"})  # figures that only programs need
 
 LABELS: Mapping[str, str] = {
     "registered": "frames with a pose",
@@ -48,7 +48,9 @@ LABELS: Mapping[str, str] = {
     "median_px": "median distance, px",
     "focal_px": "focal length, px",
     "focal_range_px": "shortest and longest focal length, px",
-    "stand_in": "stand-ins for reliable frames",
+    "fallback": "frames in place of reliable ones",
+    "focal_range_in": "frames with these",
+    "named": "frames of this camera",
     "effective_frames": "effective number of frames",
     "bins": "sections of the trajectory",
     "bins_uncovered_before": "sections without a usable frame at first",
@@ -161,14 +163,15 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
 def _show_extent(dag: Stages, run: Path, as_json: bool) -> None:
     """Print the scene's box, in the coordinates of the exports that turn nothing."""
     from cleargs.render.pruning import extent_text
-    from cleargs.run_results import scene_path, scene_stage
+    from cleargs.run_results import scene_origin, scene_path, scene_stage
     from cleargs.splat.ply import read_ply
 
     stage = scene_stage(dag, run, None)
     scene = read_ply(scene_path(run, stage))
     low, high = scene.gaussians.means.amin(0).tolist(), scene.gaussians.means.amax(0).tolist()
     facts = {"stage": stage, "gaussians": scene.gaussians.num, "low": low, "high": high}
-    answer(as_json, facts, f"scene of {stage}: {scene.gaussians.num} Gaussians", extent_text(scene))
+    origin = scene_origin(dag, run, stage)
+    answer(as_json, facts, f"scene of {origin}: {scene.gaussians.num} Gaussians", extent_text(scene))
 
 
 def _show_stage(run: Path, done: Mapping[str, Manifest], stage: str, columns: bool, as_json: bool) -> None:

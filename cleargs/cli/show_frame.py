@@ -64,7 +64,7 @@ LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # layout of the picture of a frame; wid
 def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow) -> list[str]:
     """Write the layers of a frame side by side with labels, as a PNG. Return their names.
 
-    They are the raw frame, the layers of its latest round or image formation, and the last scene at its pose.
+    They are the frame image, layers of its latest round or image formation, and the last scene at its pose.
     """
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
@@ -120,7 +120,7 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any])
             model = EFFECTS[found["model"]][0]
             lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
             sizes = ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
-            yield "formation", f"{model}, explains {100 * found['explained']:.0f} % of the misfit; {sizes}"
+            yield "formation", f"{model}, explains {100 * found['explained']:.0f} % of the residual; {sizes}"
         before, after = found["weight_before"], found["weight_after"]
         yield "weight", f"{before:.2f} before image formation, {after:.2f} after it"
     for choice in row.rounds:

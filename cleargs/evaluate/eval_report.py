@@ -114,7 +114,7 @@ class ImageResult(Figures):
         description="Share of the image that Gaussians in front of the true surface cover; null where the "
         "reference has no depth.",
     )
-    psnr_as_filmed: float | None = Field(
+    psnr_formed: float | None = Field(
         None,
         description="dB, of the scene as its camera took the frame: with the measured motion during the "
         "readout, and during the exposure time of the training's frames; null where none was measured.",
@@ -140,7 +140,7 @@ class Evaluation(Figures):
     far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
     clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
     covered: float | None = Field(None, description="Mean of `covered` over the images.")
-    psnr_as_filmed: float | None = Field(None, description="Mean of `psnr_as_filmed` over the images.")
+    psnr_formed: float | None = Field(None, description="Mean of `psnr_formed` over the images.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
     weights: dict[str, str] = Field(description="Metric -> digest of the weights behind it.")
     trained_on: int | None = Field(
@@ -229,7 +229,7 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             column("psnr_white", pa.float64(), "dB, of the scene over white", nullable=True),
             column("psnr_between", pa.float64(), "dB, between background and white", nullable=True),
             column("covered", pa.float64(), "share of the image that floaters cover", nullable=True),
-            column("psnr_as_filmed", pa.float64(), "dB, as the camera took the frame", nullable=True),
+            column("psnr_formed", pa.float64(), "dB, as the camera took the frame", nullable=True),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
             column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),

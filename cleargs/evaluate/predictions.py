@@ -16,8 +16,8 @@ from cleargs.evaluate import metrics
 from cleargs.evaluate.eval_report import Refinement
 from cleargs.evaluate.reference_views import ReferenceView
 from cleargs.evaluate.refinement import refine_pose
+from cleargs.formation.formed import FormedView
 from cleargs.formation.frame import filmed_as
-from cleargs.formation.observed import FormedView
 from cleargs.media.exr import read_depth
 from cleargs.scene.folder import SceneFolder
 from cleargs.splat.backend import rasteriser_for
@@ -41,7 +41,7 @@ class Prediction:
     """Pixels in which a scene shows something behind the sparse points; None if these are not known."""
     covered: float | None = None
     """See `covered_share`; None if the true depth is not known."""
-    as_filmed: ArrayF64 | None = None
+    formed: ArrayF64 | None = None
     """The render with the measured motion during readout and exposure; None if none was measured."""
 
 

@@ -17,7 +17,7 @@ from cleargs.capture.capture import SourceFrame
 from cleargs.capture.cutouts import are_cut_outs, over_white
 from cleargs.capture.folders import chosen, name_below_images
 from cleargs.capture.layouts.transforms import read_transforms
-from cleargs.capture.prepare import is_as_stored, read_image, read_stencil
+from cleargs.capture.prepare import is_as_stored, read_image, read_source_mask
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.errors import InputError
 from cleargs.formation.measured import MeasuredPath
@@ -103,7 +103,7 @@ def loaded(
     frame: SourceFrame, lens: Lens, way: Undistorter, cut_out: bool
 ) -> tuple[ImageU8, MaskBool | None]:
     image = read_image(frame)
-    stencil = None if cut_out and frame.mask is None else read_stencil(frame)
+    source_mask = None if cut_out and frame.mask is None else read_source_mask(frame)
     if cut_out:
         alpha = read_transparency(frame.path, upright=not is_as_stored(frame))
         assert alpha is not None  # `are_cut_outs`
@@ -114,19 +114,19 @@ def loaded(
             f"its camera {lens.width}x{lens.height}",
             hint="give the images at the size that transforms.json states (w, h)",
         )
-    if stencil is not None and stencil.shape != image.shape[:2]:
+    if source_mask is not None and source_mask.shape != image.shape[:2]:
         raise InputError(
-            f"the mask {frame.mask} has {stencil.shape[1]}x{stencil.shape[0]} pixels, "
+            f"the mask {frame.mask} has {source_mask.shape[1]}x{source_mask.shape[0]} pixels, "
             f"its image {lens.width}x{lens.height}",
             hint="make masks of the size of their images",
         )
-    image, stencil = way.image(image), None if stencil is None else way.mask(stencil)
+    image, source_mask = way.image(image), None if source_mask is None else way.mask(source_mask)
     if min(image.shape[:2]) < MIN_SIDE:
         raise InputError(
             f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels: too small to be compared",
             hint=f"give references of at least {MIN_SIDE} pixels on each side",
         )
-    return image, None if stencil is None else stencil > 0
+    return image, None if source_mask is None else source_mask > 0
 
 
 def stem_of(name: str) -> str:

@@ -55,9 +55,8 @@ def reference_of(
 ) -> Reference:
     """Return the reference for the scenes of a run, or for a scene in the world of ``directory``.
 
-    If the run's poses are from SfM, or were refined, the worlds are aligned by cameras of equal stems. Raises
-    InputError if files are missing or damaged, stems do not match, worlds do not align, or nothing was held
-    out.
+    Raises InputError if files are missing or damaged, stems do not match, worlds do not align, or nothing was
+    held out.
     """
     if run is None:
         if directory is None:
@@ -85,8 +84,7 @@ def reference_of(
                 reporter.warn(f"{missing} of {len(listed)} references match no frame: left out")
             alignment = Alignment(world="scene", matched=len(views))
         else:
-            ingested = IngestSummary.of(manifest)
-            if ingested.poses in ("sfm", "adjusted"):
+            if IngestSummary.of(manifest).poses in ("sfm", "adjusted"):
                 observed = directory.parent / "observed"  # synthetic captures have it
                 if align is None and (observed / "transforms.json").is_file():
                     align = observed
@@ -96,7 +94,7 @@ def reference_of(
                 similarity, alignment = align_cameras(theirs, ours)
                 report_fit(alignment, align or directory, reporter)
             else:
-                similarity = Similarity.from_json(ingested.similarity, ingest)
+                similarity = Similarity.read(ingest)
                 theirs = [similarity.pose(view.pose) for view in listed.values()]
                 require_one_unit(theirs, [*own.values()], _points(ingest))
             views = [

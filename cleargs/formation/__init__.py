@@ -1,6 +1,6 @@
 """Image formation: colour, motion blur, rolling shutter and defocus, and the estimation of their parameters.
 
-A raw frame is compared with the render *as its camera saw it*:
+A frame image is compared with the render *as its camera saw it*:
 
     sharp render -> colour affine -> linear light -> exposure along the motion, through the lens -> sRGB
 

@@ -1,17 +1,17 @@
 """The formation of every frame of a capture, estimated while a scene is trained on the frames.
 
-A *look* is a new estimate of a frame's formation, after every `FormationConfig.every` steps on the frame.
-Each look refines the motion with the current scene. All models are searched from scratch for a `look.Reason`:
+A frame's formation is estimated again after every `FormationConfig.every` steps on the frame. Each estimate
+refines the motion with the current scene. All models are searched from scratch for an `estimate.Reason`:
 
-| look | path of a higher order | search |
+| estimate | path of a higher order | search |
 |---|---|---|
 | first | tried | yes, but not if ``first_search`` is off or other frames show a sharp capture |
 | 4th, 8th, 16th, ... after it | tried | if the path is curved or the shutter rolls |
 | any | - | if `pretest` (a few milliseconds) finds blur that the model does not explain |
 
 `pretest` cannot see a skew: while a rolling shutter is possible, frames are searched for it. Later trainings
-continue with formations and numbers of looks. They keep the formation of a frame that had `SETTLED` looks,
-unless the shutter rolls.
+continue with formations and numbers of estimates. They keep the formation of a frame after
+`ESTIMATES_TO_KEEP` estimates, unless the shutter rolls.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.formation.estimate import Shot, Terms, fit_motion
 from cleargs.formation.exposure import AffineOptimiser, Exposure
+from cleargs.formation.formed import FormedView
 from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
-from cleargs.formation.look import Shot, Terms, fit_motion
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.movement import Movement
-from cleargs.formation.observed import FormedView
 from cleargs.formation.shutter import (
     MIN_TIMED_FRAMES,
     ROLLING,
@@ -52,13 +52,13 @@ ROLLING_START = 0.1
 """Fraction of the schedule from which frames are tested for a rolling shutter. The scene gradually learns the
 skew of the frames. At places that few frames see, it hides their skew before `FormationConfig.start`
 (docs/experiments/formation.md)."""
-DOUBTED = 0.5
-"""RVA weight below which a frame is doubted: less blur is then enough for a search."""
-AGAIN = 4
-"""Number of looks from the first one to the next try of a higher order and, if the shutter rolls, to the next
-search. It doubles from one try to the next, because the scene changes less and less."""
-SETTLED = 7
-"""Looks at a frame after which later trainings keep its formation. Scenes lost nothing after 7 and 15 looks,
+LOW_WEIGHT = 0.5
+"""RVA weight below which less blur is enough for a search."""
+RETRY_AFTER = 4
+"""Number of estimates from the first one to the next try of a higher order and, if the shutter rolls, to the
+next search. It doubles from one try to the next, because the scene changes less and less."""
+ESTIMATES_TO_KEEP = 7
+"""Estimates of a frame's formation after which later trainings keep it. Scenes lost nothing after 7 and 15,
 and up to 0.2 dB after 3 (docs/experiments/formation.md)."""
 CLEAR_BLUR, EXPOSED_FRAMES, MIN_EXPOSED_FRAMES = 3.0, 9, 3
 """Blur, px, that shows the exposure time of its frame; largest and smallest number of frames around a frame
@@ -66,18 +66,20 @@ from which its exposure time is known."""
 MEASURED_SHARE = 0.5
 """Least share of the frames with a measured motion, at which ingest decides if the shutter rolls."""
 SHARP_SHARE, MIN_SEARCHED_FRAMES = 1 / 8, 12
-"""A capture is sharp if at most this share of the frames that had a look need a model, and at least this many
-had one. In a sharp capture a frame is searched at its first look only if the test finds blur."""
+"""A capture is sharp if at most this share of the frames with an estimate need a model, and at least this
+many have one. In a sharp capture a frame is first searched only if the test finds blur."""
 
 
-def median_misfit(frames: Iterable[FrameFormation], weights: Mapping[int, float]) -> float:
-    """Return the median misfit (difference from the render), weighted by ``weights``; 0 if none is known."""
-    known = sorted((frame.misfit, weights.get(frame.frame_id, 0.0)) for frame in frames if frame.misfit > 0.0)
+def median_residual(frames: Iterable[FrameFormation], weights: Mapping[int, float]) -> float:
+    """Return the median residual of the frames, weighted by ``weights``; 0 if none is known."""
+    known = sorted(
+        (frame.residual, weights.get(frame.frame_id, 0.0)) for frame in frames if frame.residual > 0.0
+    )
     half, passed = 0.5 * math.fsum(weight for _, weight in known), 0.0
-    for misfit, weight in known:
+    for residual, weight in known:
         passed += weight
         if passed >= half:
-            return misfit
+            return residual
     return 0.0
 
 
@@ -93,7 +95,7 @@ class CaptureFormation:
         lr_exposure: float = 0.0,  # learning rate of the affines
         known: Mapping[int, FrameFormation] | None = None,  # from an earlier training, by frame_id
         moving: Mapping[int, MaskBool] | None = None,  # cells that move, from an earlier training
-        tolerance: float = 0.0,  # difference of mean sRGB colours above which a cell can move; 0: no looks
+        tolerance: float = 0.0,  # difference of mean sRGB colours above which a cell can move; 0: no checks
         measured: Mapping[int, MeasuredPath] | None = None,  # motions of ingest, by frame_id
     ) -> None:
         weighted = [view for view in views if view.weight > 0.0]
@@ -107,9 +109,9 @@ class CaptureFormation:
         self._readout_found = any(path.rolls for path in self._measured.values())
         self._shutter_measured = judged >= max(MIN_TIMED_FRAMES, MEASURED_SHARE * len(real))
         if self._rolls():  # a training begins with a search of each frame
-            self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
-        enough = (SETTLED - 1) * config.every
-        self._settled = {frame_id for frame_id, frame in self._frames.items() if frame.draws > enough}
+            self._frames = {k: replace(frame, steps=0) for k, frame in self._frames.items()}
+        enough = (ESTIMATES_TO_KEEP - 1) * config.every
+        self._kept = {frame_id for frame_id, frame in self._frames.items() if frame.steps > enough}
         self._tested = {real[k] for k in frames_to_test(len(real))}
         self._weights = {view.frame_id: view.weight for view in filmed}
         self._speeds = CameraSpeeds.of(filmed)
@@ -118,7 +120,7 @@ class CaptureFormation:
         cameras = {view.frame_id: view.camera for view in weighted}
         likely = {view.frame_id: view.movers for view in weighted if view.movers}
         self._movement = Movement(cameras, tolerance, moving, likely)
-        self._draws = dict.fromkeys(cameras, 0)
+        self._visits = dict.fromkeys(cameras, 0)
 
     @property
     def exposure(self) -> Exposure | None:
@@ -127,7 +129,7 @@ class CaptureFormation:
 
     @property
     def frames(self) -> dict[int, FrameFormation]:
-        """Formations of the raw frames, by frame_id."""
+        """Formations of the frames, by frame_id."""
         return dict(self._frames)
 
     @property
@@ -136,19 +138,19 @@ class CaptureFormation:
         return self._movement.masks()
 
     def weight(self, frame_id: int) -> float:
-        """Return the weight of a raw frame in the training: RVA's weight, or its trust if that is larger.
+        """Return the weight of a frame image in the training: RVA's weight, or its trust if that is larger.
 
-            w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
+            w = max(w_RVA, trust),  trust = min(1, rho / residual)^p
 
-        rho is the median misfit of the frames, weighted by w_RVA, and p is `FormationConfig.trust`. A frame
+        rho is the median residual of the frames, weighted by w_RVA, and p is `FormationConfig.trust`. A frame
         that is explained as well as reliable frames counts like one of them, also if it needs no model: RVA
-        can mistake a sharp photograph of soft things, such as fur, for a blurred one.
+        can mistake a sharp frame image of soft things, such as fur, for a blurred one.
         """
         prior, frame = self._weights[frame_id], self._frames[frame_id]
-        if frame.misfit <= 0.0:  # not compared with the scene so far
+        if frame.residual <= 0.0:  # not compared with the scene so far
             return prior
-        reference = median_misfit(self._frames.values(), self._weights)
-        trust: float = min(1.0, reference / frame.misfit) ** self._config.trust
+        reference = median_residual(self._frames.values(), self._weights)
+        trust: float = min(1.0, reference / frame.residual) ** self._config.trust
         return max(prior, trust)
 
     def form(
@@ -156,7 +158,7 @@ class CaptureFormation:
         view: TrainingView,
         factor: float,
         progress: float,
-        target: Tensor,
+        observed: Tensor,
         mask: Tensor | None,
         render: Renderer,
     ) -> FormedView | None:
@@ -164,27 +166,27 @@ class CaptureFormation:
         frame_id, camera = view.frame_id, view.camera.scaled(factor)
         affines = self._affines
         affine = None if affines is None else affines.affine(frame_id)
-        own, mask = mask, self._movement.still(frame_id, mask, target)
+        own, mask = mask, self._movement.static_mask(frame_id, mask, observed)
         weight, motion = view.weight, None
         if self._config.enabled and view.kind == "real":
-            shot = Shot(camera, affine, target, mask, render, factor)
+            shot = Shot(camera, affine, observed, mask, render, factor)
             if self._estimated(frame_id, progress, shot):
                 frame = self._frames[frame_id]
-                self._frames[frame_id] = replace(frame, draws=frame.draws + 1)
+                self._frames[frame_id] = replace(frame, steps=frame.steps + 1)
                 weight = self.weight(frame_id)
             frame = self._frames[frame_id]
             motion = None if frame.model == "none" else frame
 
-        def look(image: Tensor, rendered: Render, margin: int) -> Tensor | None:
+        def check(image: Tensor, rendered: Render, margin: int) -> Tensor | None:
             """Find what moves in the frame, and return the pixels that count."""
-            self._movement.look(frame_id, image, rendered, margin, target, own)
-            return self._movement.still(frame_id, own, target)
+            self._movement.check(frame_id, image, rendered, margin, observed, own)
+            return self._movement.static_mask(frame_id, own, observed)
 
-        looks = False
+        checks = False
         if view.kind == "real" or frame_id not in self._frames:
-            looks = self._movement.due(self._draws[frame_id], progress)
-            self._draws[frame_id] += 1
-        if motion is None and affine is None and mask is own and weight == view.weight and not looks:
+            checks = self._movement.due(self._visits[frame_id], progress)
+            self._visits[frame_id] += 1
+        if motion is None and affine is None and mask is own and weight == view.weight and not checks:
             return None
         return FormedView(
             camera,
@@ -195,33 +197,33 @@ class CaptureFormation:
             formation=motion,
             factor=factor,
             mask=mask,
-            look=look if looks else None,
+            check=check if checks else None,
         )
 
     def _estimated(self, frame_id: int, progress: float, shot: Shot) -> bool:
         """Estimate the formation of a frame if it is due. Return False before the estimates begin."""
         if progress < self._config.start and not self._rolls():
             if progress >= ROLLING_START and self._asks(frame_id):
-                gain = self._look(frame_id, shot).skew_gain
+                gain = self._estimate(frame_id, shot).skew_gain
                 self._frames[frame_id] = replace(self._frames[frame_id], skew_gain=gain)
             if not self._rolls():
                 return False
         if self._due(frame_id):
-            self._frames[frame_id] = self._look(frame_id, shot)
-            if self._all_looked_at(frame_id):
+            self._frames[frame_id] = self._estimate(frame_id, shot)
+            if self._all_estimated(frame_id):
                 self._add_missing_skew()
         return True
 
-    def _look(self, frame_id: int, shot: Shot) -> FrameFormation:
+    def _estimate(self, frame_id: int, shot: Shot) -> FrameFormation:
         """Return the formation of a frame, estimated with the current scene."""
         frame = self._frames[frame_id]
-        tested: Literal["tested", "still"] = "tested" if self._asks(frame_id) else "still"
+        tested: Literal["tested", "global"] = "tested" if self._asks(frame_id) else "global"
         terms = Terms(
             pose=frame_id in self._posed,
-            doubted=self._weights[frame_id] < DOUBTED,
-            shutter="rolls" if self._rolls(frame_id) else tested,
-            curve=_searched_again(frame.draws // self._config.every),
-            sparing=not self._config.first_search or self._sharp(),
+            low_weight=self._weights[frame_id] < LOW_WEIGHT,
+            shutter="rolling" if self._rolls(frame_id) else tested,
+            curve=_tries_higher_order(frame.steps // self._config.every),
+            only_if_blur_found=not self._config.first_search or self._sharp(),
             exposure_s=self._exposure(frame_id),
             measured=self._measured.get(frame_id),
         )
@@ -251,7 +253,7 @@ class CaptureFormation:
     def state(self) -> dict[str, Tensor]:
         """Return the numbers of all frames, and the affines with their moments."""
         state = {"frames": torch.from_numpy(packed(self._frames.values())), **self._movement.state()}
-        state["movement.draws"] = torch.tensor(list(self._draws.values()))
+        state["movement.visits"] = torch.tensor(list(self._visits.values()))
         if self._affines is not None:
             for name, array in self._affines.arrays().items():
                 state[f"exposure.{name}"] = torch.from_numpy(array)
@@ -260,7 +262,7 @@ class CaptureFormation:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Continue from the result of `state`."""
         self._movement.restore(state)
-        self._draws = dict(zip(self._draws, state["movement.draws"].tolist(), strict=True))
+        self._visits = dict(zip(self._visits, state["movement.visits"].tolist(), strict=True))
         self._frames = {frame.frame_id: frame for frame in unpacked(state["frames"].numpy())}
         if self._affines is not None:
             affines = group(state, "exposure.")
@@ -273,7 +275,7 @@ class CaptureFormation:
         return None
 
     def _unseen(self, view: TrainingView) -> FrameFormation:
-        """Return the formation of a frame before the first look: its measured skew."""
+        """Return the formation of a frame before the first estimate: its measured skew."""
         path = self._measured.get(view.frame_id)
         if path is None or not path.rolls:
             return FrameFormation(view.frame_id)
@@ -302,16 +304,16 @@ class CaptureFormation:
 
     def _due(self, frame_id: int) -> bool:
         """Return True if the formation of a frame is estimated before the next step on it."""
-        draws = self._frames[frame_id].draws
-        return draws == 0 or (draws % self._config.every == 0 and frame_id not in self._settled)
+        steps = self._frames[frame_id].steps
+        return steps == 0 or (steps % self._config.every == 0 and frame_id not in self._kept)
 
-    def _all_looked_at(self, frame_id: int) -> bool:
-        """Return True if a look at this frame completes a round of looks at all frames."""
-        before = self._frames[frame_id].draws
-        return all(frame.draws > before for k, frame in self._frames.items() if k != frame_id)
+    def _all_estimated(self, frame_id: int) -> bool:
+        """Return True if an estimate of this frame completes a round of estimates of all frames."""
+        before = self._frames[frame_id].steps
+        return all(frame.steps > before for k, frame in self._frames.items() if k != frame_id)
 
     def _add_missing_skew(self) -> None:
-        """Add the skew that all frames lack in common (`shutter`). The scene adapts until the next look."""
+        """Add the skew that all frames lack in common (`shutter`). The scene then adapts to it."""
         if self._speeds is None or not self._rolls():
             return
         missing = self._speeds.missing_skew(self._frames)
@@ -319,15 +321,15 @@ class CaptureFormation:
             self._frames = {k: with_skew(frame, missing) for k, frame in self._frames.items()}
 
     def _sharp(self) -> bool:
-        """Return True if few of the frames that were looked at so far needed a model."""
-        models = [frame.model for frame in self._frames.values() if frame.draws > 0]
+        """Return True if few of the frames with an estimate needed a model."""
+        models = [frame.model for frame in self._frames.values() if frame.steps > 0]
         modelled = len(models) - models.count("none")
         return len(models) >= MIN_SEARCHED_FRAMES and modelled <= SHARP_SHARE * len(models)
 
 
-def _searched_again(looks: int) -> bool:
-    """Return True for 0 and for `AGAIN` times a power of two: 0, 4, 8, 16, 32, ..."""
-    rounds, rest = divmod(looks, AGAIN)
+def _tries_higher_order(estimates: int) -> bool:
+    """Return True for 0 and for `RETRY_AFTER` times a power of two: 0, 4, 8, 16, 32, ..."""
+    rounds, rest = divmod(estimates, RETRY_AFTER)
     return rest == 0 and rounds & (rounds - 1) == 0
 
 

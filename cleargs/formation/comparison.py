@@ -1,7 +1,8 @@
-"""Comparison of a raw frame and a render under a motion, at one size.
+"""Comparison of a frame image and a render under a motion, at one size.
 
-The *misfit* is the mean difference of high-passed luminance in linear light. A quarter of the pixels, in
-blocks, is held out from every fit. The misfit on the held-out pixels decides which model explains the frame.
+The *residual* is the mean difference of high-passed luminance in linear light. A quarter of the pixels, in
+blocks, is held out from every fit. The residual on the held-out pixels decides which model explains the
+frame.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ HIGH_PASS = 6.0
 frequency, such as those of illumination, say nothing about motion."""
 
 OUTLIER, LIMIT = 0.03, 0.1
-"""Differences of linear light. Fits count those above `OUTLIER` linearly; misfits count at most `LIMIT`."""
+"""Differences of linear light. Fits count those above `OUTLIER` linearly; residuals count at most `LIMIT`."""
 
-MIN_MISFIT = 5e-4
-"""Misfit, in linear light, below which there is nothing to explain: the error of rounding to eight bits."""
+MIN_RESIDUAL = 5e-4
+"""Residual, in linear light, below which there is nothing to explain: the error of rounding to eight bits."""
 
 HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
 """Side, px, of the blocks, of which every fourth is held out."""
@@ -46,7 +47,7 @@ HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """A raw frame and the render that should explain it.
+    """A frame image and the render that should explain it.
 
     ``luminance``, ``depth`` and ``alpha`` of the render are larger than the frame by ``margin`` pixels on
     every side. ``camera`` is that of the frame.
@@ -63,24 +64,24 @@ class FramePair:
 
 @dataclass(frozen=True, eq=False)
 class MotionFit:
-    """A model of a frame with the misfit that it leaves."""
+    """A model of a frame with the residual that it leaves."""
 
     model: Model
     motion: FrameMotion
-    misfit: float
+    residual: float
     """Mean difference that remains on the held-out pixels, each at most `LIMIT`."""
-    misfit_still: float
-    """Misfit without any motion."""
+    residual_without: float
+    """Residual without any motion."""
 
     @property
     def explained(self) -> float:
-        """Share of the misfit that the model removes."""
-        return explained_share(self.misfit, self.misfit_still)
+        """Share of the residual that the model removes."""
+        return explained_share(self.residual, self.residual_without)
 
 
-def explained_share(misfit: float, misfit_still: float) -> float:
-    """Return 1 - ``misfit`` / ``misfit_still``, or 0 if ``misfit_still`` is at most `MIN_MISFIT`."""
-    return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
+def explained_share(residual: float, residual_without: float) -> float:
+    """Return 1 - ``residual`` / ``residual_without``; 0 if the latter is at most `MIN_RESIDUAL`."""
+    return 1.0 - residual / residual_without if residual_without > MIN_RESIDUAL else 0.0
 
 
 def luminance(image: ArrayF32) -> ArrayF32:
@@ -135,7 +136,7 @@ class Level:
             )
         )
 
-    # Only a fit needs the next properties. The misfit without any motion is computed without them.
+    # Only a fit needs the next properties. The residual without any motion is computed without them.
 
     @cached_property
     def median(self) -> float:
@@ -173,26 +174,26 @@ class Level:
 
     @cached_property
     def _still(self) -> float:
-        """Misfit without any motion."""
+        """Residual without any motion."""
         fields = self._nowhere, self._nowhere, self._nowhere[0], None
-        total = cpu.misfit(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
+        total = cpu.residual(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
         return total / self._total
 
     def evaluate(self, model: Model, motion: FrameMotion) -> MotionFit:
-        """Return the misfit of a motion on the held-out pixels."""
-        misfit = self._still
+        """Return the residual of a motion on the held-out pixels."""
+        residual = self._still
         if model != "none":
             times = DISC if model == "defocus" else FINE
-            misfit = self._misfit(motion, times, self._holdout) / self._total
-        return MotionFit(model, motion, misfit, self._still)
+            residual = self._residual(motion, times, self._holdout) / self._total
+        return MotionFit(model, motion, residual, self._still)
 
     def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:
         """Return the sum of the differences on the pixels that are not held out."""
-        return self._misfit(motion, times, self._fitting)
+        return self._residual(motion, times, self._fitting)
 
-    def _misfit(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
+    def _residual(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
         fields = self.fields(motion, curved=motion.order > 1)
-        return cpu.misfit(self._image, self._observed, weight, fields, times, LIMIT)
+        return cpu.residual(self._image, self._observed, weight, fields, times, LIMIT)
 
     def fields(
         self, motion: FrameMotion, curved: bool

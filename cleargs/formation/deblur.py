@@ -1,4 +1,4 @@
-"""Removal of the estimated blur, skew or defocus from a raw frame."""
+"""Removal of the estimated blur, skew or defocus from a frame image."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from cleargs.types import ArrayF32
 
 PRIOR = 0.1
 """Variance of the part of a frame that its formation does not explain, over that of the error of the render.
-Frequencies that the exposure passes with more than this share of their power come from the raw frame, the
+Frequencies that the exposure passes with more than this share of their power come from the frame image, the
 others from the render."""
 
 OUTLIER = 0.15
-"""Difference in sRGB between raw frame and exposed render above which a pixel counts less, since it may show
-something that moved."""
+"""Difference in sRGB between frame image and exposed render above which a pixel counts less, since it may
+show something that moved."""
 
 STEPS = 10
 """Steps of the solver; fifty more change the image by less than 1/255 on average."""

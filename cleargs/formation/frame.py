@@ -22,7 +22,7 @@ MARGIN_SHARE = 0.25
 """Largest margin, as a share of the shorter side."""
 
 LENS = ("disc_px", "focus", "median_depth", "exposure_s")
-MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
+MEASURED = ("residual", "residual_without", "blur_px", "skew_px", "defocus_px", "displacement_px")
 """Fields of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 
@@ -34,23 +34,23 @@ class FrameFormation:
     frame_id: int
     motion: FrameMotion = field(default_factory=FrameMotion)
     model: Model = "none"
-    misfit: float = 0.0
+    residual: float = 0.0
     """Mean difference of high-passed linear luminance that the model leaves, see `comparison.MotionFit`."""
-    misfit_still: float = 0.0
+    residual_without: float = 0.0
     blur_px: float = 0.0
     """Mean length of the pixels' paths during the exposure."""
     skew_px: float = 0.0
     """Mean length of the pixels' paths from the first to the last row's exposure."""
     defocus_px: float = 0.0
     """Mean radius of the discs of defocus."""
-    reach_px: float = 0.0
+    displacement_px: float = 0.0
     """Largest displacement of a pixel's samples along an axis: the 95th percentile over the pixels."""
     skew_gain: float | None = None
-    """Share of the misfit that a rolling shutter explains beyond blur and defocus, by the last search that
+    """Share of the residual that a rolling shutter explains beyond blur and defocus, by the last search that
     tried one; None if none did."""
-    evidence: float = 0.0
-    """Least evidence of further blur since the last search."""
-    draws: int = 0
+    blur_gain: float = 0.0
+    """Least gain of a further blur (`pretest`) since the last search."""
+    steps: int = 0
     """Training steps on the frame since the first estimate of its formation."""
 
     @property
@@ -60,16 +60,16 @@ class FrameFormation:
 
     @property
     def explained(self) -> float:
-        """Share of the misfit that the model removes."""
-        return explained_share(self.misfit, self.misfit_still)
+        """Share of the residual that the model removes."""
+        return explained_share(self.residual, self.residual_without)
 
 
 def filmed_as(motion: FrameMotion, frame_id: int = -1) -> FrameFormation:
     """Return the formation of a frame with a measured ``motion``."""
     # No pixel moves farther than at the first and at the last row, and at the ends of the exposure.
-    reach = 0.5 * float(np.abs(motion.skew).sum() + np.abs(motion.blur).sum())
+    displacement = 0.5 * float(np.abs(motion.skew).sum() + np.abs(motion.blur).sum())
     model = named("blur" if motion.blur.any() else "none", motion)
-    return FrameFormation(frame_id, motion, model, reach_px=reach)
+    return FrameFormation(frame_id, motion, model, displacement_px=displacement)
 
 
 def described(frame: FrameFormation) -> str:
@@ -79,8 +79,8 @@ def described(frame: FrameFormation) -> str:
     return ", ".join(f"{part} {lengths[part]:.1f} px" for part in parts if part in lengths) or "nothing"
 
 
-def reach_of(fields: DisplacementFields) -> float:
-    """Return the reach of the pixels, px: see `FrameFormation.reach_px`."""
+def displacement_of(fields: DisplacementFields) -> float:
+    """Return the displacement of the pixels, px: see `FrameFormation.displacement_px`."""
     few = (..., slice(None, None, 4), slice(None, None, 4))
     displacements = fields.offset[few].abs() + 0.5 * fields.sweep[few].abs() + fields.radius[few]
     if fields.curve is not None:
@@ -89,16 +89,16 @@ def reach_of(fields: DisplacementFields) -> float:
     return float(np.quantile(displacements.amax(dim=0).cpu().numpy(), 0.95))
 
 
-def margin_for(reach: float, camera: Camera) -> int:
+def margin_for(displacement: float, camera: Camera) -> int:
     """Return the margin, px, that contains the pixels that moved in from outside the border."""
     largest = int(MARGIN_SHARE * min(camera.width, camera.height)) // MARGIN_STEP * MARGIN_STEP
-    return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
+    return min(largest, MARGIN_STEP * math.ceil(displacement / MARGIN_STEP)) if displacement >= 0.5 else 0
 
 
 def as_row(frame: FrameFormation) -> dict[str, Any]:
     """Return the numbers of the frame by their names in ``formation.parquet``."""
     motion = frame.motion
-    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws", "evidence")}
+    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "steps", "blur_gain")}
     for name in TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
     row |= {name: getattr(motion, name) for name in (*LENS, "columns")} | {"order": motion.order}
@@ -106,19 +106,11 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """Return the frame of a row from `as_row`. Older tables lack some columns."""
-    twists = [row.get(f"{name}_{axis}") for name in TWISTS for axis in AXES]
-    # Not `or 0.0`, which would lose the sign of -0.0, and with it the bits of a resumed training.
-    vector = np.array([0.0 if value is None else value for value in twists])
-    lens = {name: row[name] for name in LENS if row.get(name) is not None}
-    return FrameFormation(
-        row["frame_id"],
-        FrameMotion(**lens, columns=bool(row.get("columns"))).with_vector(vector),
-        row["model"],
-        evidence=row.get("evidence") or 0.0,
-        draws=row.get("draws") or 0,
-        **{name: row[name] for name in (*MEASURED, "skew_gain")},
-    )
+    """Return the frame of a row from `as_row`."""
+    vector = np.array([row[f"{name}_{axis}"] for name in TWISTS for axis in AXES])
+    motion = FrameMotion(**{name: row[name] for name in LENS}, columns=bool(row["columns"]))
+    own = {name: row[name] for name in ("model", "steps", "blur_gain", *MEASURED, "skew_gain")}
+    return FrameFormation(row["frame_id"], motion.with_vector(vector), **own)
 
 
 def packed(frames: Iterable[FrameFormation]) -> NDArray[np.float64]:
@@ -136,5 +128,5 @@ def unpacked(numbers: NDArray[np.float64]) -> Iterator[FrameFormation]:
     names = tuple(as_row(FrameFormation(0)))
     for row in (dict(zip(names, values, strict=True)) for values in numbers.tolist()):
         gain = None if row["skew_gain"] < 0.0 else row["skew_gain"]
-        counts = {name: int(row[name]) for name in ("frame_id", "draws")}
+        counts = {name: int(row[name]) for name in ("frame_id", "steps")}
         yield from_row(row | counts | {"model": MODELS[int(row["model"])], "skew_gain": gain})

@@ -25,7 +25,7 @@ Model: TypeAlias = Literal["none", "blur", "skew", "both", "defocus"]
 MODELS: tuple[Model, ...] = ("none", "blur", "skew", "both", "defocus")
 
 
-def _still() -> ArrayF64:
+def _zeros() -> ArrayF64:
     return np.zeros(TWIST)
 
 
@@ -41,18 +41,18 @@ class FrameMotion:
     higher order does not change the mean pose and the lower orders.
     """
 
-    blur: ArrayF64 = field(default_factory=_still)
+    blur: ArrayF64 = field(default_factory=_zeros)
     """Motion from the start to the end of a row's exposure: the part of the path that is linear in time."""
-    skew: ArrayF64 = field(default_factory=_still)
+    skew: ArrayF64 = field(default_factory=_zeros)
     """Motion from the first to the last row's exposure (rolling shutter); 0 at the middle row."""
-    skew_bend: ArrayF64 = field(default_factory=_still)
+    skew_bend: ArrayF64 = field(default_factory=_zeros)
     """Second order of a measured skew: times s^2 at s of the readout, -1/2 to 1/2."""
     columns: bool = False
     """True if the columns are read one after the other: ``skew`` is from the first to the last column."""
-    pose: ArrayF64 = field(default_factory=_still)
+    pose: ArrayF64 = field(default_factory=_zeros)
     """Motion from the given pose of the frame to the mean pose of its exposure."""
-    bend: ArrayF64 = field(default_factory=_still)
-    cube: ArrayF64 = field(default_factory=_still)
+    bend: ArrayF64 = field(default_factory=_zeros)
+    cube: ArrayF64 = field(default_factory=_zeros)
     disc_px: float = 0.0
     """Radius of the disc of defocus, pixels per unit of nearness beyond the focus."""
     focus: float = 1.0
@@ -72,10 +72,10 @@ class FrameMotion:
         return replace(self, pose=pose, blur=blur, skew=skew, bend=bend, cube=cube, skew_bend=skew_bend)
 
     def exposed_only(self) -> FrameMotion | None:
-        """Return the motion during the exposure and the defocus, without pose and skew; None if still."""
+        """Return the motion during the exposure and the defocus, without pose and skew, if there are any."""
         if not (self.blur.any() or self.bend.any() or self.cube.any() or self.disc_px > 0.0):
             return None
-        return replace(self, pose=_still(), skew=_still(), skew_bend=_still())
+        return replace(self, pose=_zeros(), skew=_zeros(), skew_bend=_zeros())
 
     @property
     def order(self) -> int:
@@ -115,7 +115,7 @@ def flow_basis(
     """Return the displacement of every pixel under each component of a twist, [6, 2, H, W] pixels per unit.
 
     The twist is the motion of the scene past the camera. A displacement points from a pixel to the place in
-    the still image that it shows. It equals the optical flow of the same motion of the camera. Pixels are
+    the sharp image that it shows. It equals the optical flow of the same motion of the camera. Pixels are
     those of ``nearness``. The image of ``camera`` may be larger, in proportion.
     Source: Longuet-Higgins & Prazdny, "The interpretation of a moving retinal image" (1980).
     """

@@ -56,7 +56,7 @@ MIN_CELLS = 6
 LIKELY = 2.0
 """Factor by which evidence may be weaker in the box of something that may move; its regions may be small."""
 EVERY = 3
-"""Steps on a frame between two looks (comparisons that update the cells that move)."""
+"""Steps on a frame between two checks (comparisons that update the cells that move)."""
 START = 0.25
 """Share of the schedule from which movement is looked for."""
 
@@ -110,29 +110,29 @@ class Movement:
             [(c.fx / c.width, c.fy / c.height, c.cx / c.width, c.cy / c.height) for c in self._cameras]
         ).reshape(-1, 4)
 
-    def due(self, draws: int, progress: float) -> bool:
-        """Return True if a step on a frame, after ``draws`` earlier ones, includes a look."""
-        return self._tolerance > 0.0 and progress >= START and draws % EVERY == 0
+    def due(self, visits: int, progress: float) -> bool:
+        """Return True if a step on a frame, after ``visits`` earlier ones, includes a check."""
+        return self._tolerance > 0.0 and progress >= START and visits % EVERY == 0
 
     def masks(self) -> dict[int, MaskBool]:
         """Return the cells that move [rows, columns], by frame_id, for frames in which something moves."""
         return {frame_id: self._moves[k] for frame_id, k in self._place.items() if self._moves[k].any()}
 
-    def look(
+    def check(
         self,
         frame_id: int,
         image: Tensor,  # [H, W, 3] sRGB, the render as the frame's camera saw it
         render: Render,  # sharp, with depth
         margin: int,  # pixels by which ``render`` is larger on every side
-        target: Tensor,  # [H, W, 3] sRGB
+        observed: Tensor,  # [H, W, 3] sRGB
         mask: Tensor | None,  # [H, W] pixels that count by the user's mask
     ) -> None:
-        """Compare a frame, ``target``, with the scene, and update the cells that move in it."""
+        """Compare a frame, ``observed``, with the scene, and update the cells that move in it."""
         k, (height, width) = self._place[frame_id], image.shape[:2]
         assert render.depth is not None
         inner = slice(margin, margin + height), slice(margin, margin + width)
         counted = np.ones((height, width), np.float32) if mask is None else mask.float().cpu().numpy()
-        difference = (image - target).cpu().numpy() * counted[..., None]
+        difference = (image - observed).cpu().numpy() * counted[..., None]
         shares, alpha = self._pooled(counted), self._pooled(render.alpha[inner].cpu().numpy())
         known = (shares > 0.25) & (alpha > 0.5)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -158,10 +158,10 @@ class Movement:
         unwitnessed[asked] = witnesses < MIN_OTHERS
         self._moves[k] = regions(moves, likely) | (self._moves[k] & unwitnessed)  # these stay as they were
 
-    def still(self, frame_id: int, mask: Tensor | None, target: Tensor) -> Tensor | None:
+    def static_mask(self, frame_id: int, mask: Tensor | None, observed: Tensor) -> Tensor | None:
         """Return the pixels of a frame that count: see `counted`."""
         k = self._place.get(frame_id)
-        return counted(mask, None if k is None or not self._moves[k].any() else self._moves[k], target)
+        return counted(mask, None if k is None or not self._moves[k].any() else self._moves[k], observed)
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that the training changes, for a checkpoint."""
@@ -186,8 +186,8 @@ class Movement:
         """Return the differences of other frames at the places that C cells of frame ``k`` show at ``depth``.
 
         These are three arrays [C]: the median of the differences, infinite if no other frame sees the place;
-        the number of frames that see it and had a look; and the share of the `NEAR_FRAMES` of these with the
-        nearest cameras in which it moves.
+        the number of checked frames that see it; and the share of the `NEAR_FRAMES` of these with the nearest
+        cameras in which it moves.
         """
         rows, columns = self._moves.shape[1:]
         fx, fy, cx, cy = self._lenses[k]
@@ -230,15 +230,15 @@ def regions(cells: MaskBool, likely: MaskBool | None = None) -> MaskBool:  # [ro
     return np.asarray(cv2.dilate(large[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
-def counted(mask: Tensor | None, moves: MaskBool | None, target: Tensor) -> Tensor | None:
-    """Return the pixels [H, W] of ``mask`` in which nothing moves; None: all of ``target`` [H, W, 3]."""
+def counted(mask: Tensor | None, moves: MaskBool | None, observed: Tensor) -> Tensor | None:
+    """Return the pixels [H, W] of ``mask`` in which nothing moves; None: all of ``observed`` [H, W, 3]."""
     if moves is None:
         return mask
-    counts = torch.from_numpy(still_pixels(moves, target.shape[0], target.shape[1])).to(target.device)
+    counts = torch.from_numpy(static_pixels(moves, observed.shape[0], observed.shape[1])).to(observed.device)
     return counts if mask is None else counts & mask
 
 
-def still_pixels(moves: MaskBool, height: int, width: int) -> MaskBool:
+def static_pixels(moves: MaskBool, height: int, width: int) -> MaskBool:
     """Return the pixels [height, width] that are in no cell of ``moves`` [rows, columns]."""
     rows = np.arange(height) * moves.shape[0] // height
     columns = np.arange(width) * moves.shape[1] // width

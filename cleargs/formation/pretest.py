@@ -1,6 +1,6 @@
-"""Test in a few milliseconds if a photograph has blur that a render does not have, and in which direction.
+"""Test in a few milliseconds if a frame image has blur that a render does not have, and in which direction.
 
-For a small blur of covariance S the photograph is
+For a small blur of covariance S the frame image is
 
     offset + gain * render + shift . grad(render) + tr(S H(render)) / 2
 
@@ -36,22 +36,22 @@ TILE = 32
 MIN_TILE = 4
 
 MIN_VARIANCE = 0.05
-"""Variance below which a blur does not count as evidence, px^2: that of a sweep of 0.8 px."""
+"""Variance below which a blur does not count, px^2: that of a sweep of 0.8 px."""
 
-_STILL, _ALL = 4, 7
+_SHARP, _ALL = 4, 7
 """Number of parameters without a blur, and of all parameters."""
 _RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
-class BlurEvidence:
-    """Blur that a photograph has and a render has not. Lengths are in pixels of the photograph."""
+class MissingBlur:
+    """Blur that a frame image has and a render has not. Lengths are in pixels of the frame image."""
 
     line_gain: float
     """Share of the squared error on unseen tiles that a blur along one direction removes."""
     line: float
     """Variance of that blur, px^2: L^2 / 12 for a straight sweep of length L. Negative where the render is
-    blurrier than the photograph."""
+    blurrier than the frame image."""
     angle: float
     """Direction of that blur, radians from the x axis towards the y axis."""
     disc_gain: float
@@ -72,18 +72,18 @@ class BlurEvidence:
         return math.sqrt(12.0 * max(self.line, 0.0))
 
 
-NO_EVIDENCE = BlurEvidence(0.0, 0.0, 0.0, 0.0, 0.0)
+NONE_MISSING = MissingBlur(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def blur_evidence(
+def missing_blur(
     render: PlaneF32,  # [H, W] linear luminance
     observed: PlaneF32,  # [H, W] likewise
     weight: PlaneF32,  # [H, W] 0 where a pixel does not count
-) -> BlurEvidence:
-    """Return the evidence at the size of the pyramid at which a blur explains most."""
+) -> MissingBlur:
+    """Return the missing blur at the size of the pyramid at which a blur explains most."""
     height, width = observed.shape
     scale = min(1.0, LARGEST / max(height, width))
-    best = NO_EVIDENCE
+    best = NONE_MISSING
     for k in range(SIZES):
         size = round(0.5**k * scale * width), round(0.5**k * scale * height)
         if (min(size) < SMALLEST and k > 0) or min(size) < 3:
@@ -106,8 +106,8 @@ def _reduced(image: PlaneF32, size: tuple[int, int], *, smooth: bool = True) -> 
 
 def _fitted(
     sums: ArrayF64,  # [2, 8, 8] products of the regressors over the tiles of each colour
-    pixel: float,  # photograph pixels per pixel of this size
-) -> BlurEvidence:
+    pixel: float,  # pixels of the frame image per pixel of this size
+) -> MissingBlur:
     halves = (sums[0], sums[1]), (sums[1], sums[0])
 
     def fit(shape: ArrayF64) -> tuple[float, ArrayF64]:
@@ -117,17 +117,17 @@ def _fitted(
         errors = [float(x @ unseen @ x) for (_, unseen), x in zip(halves, left, strict=True)]
         return math.fsum(errors), np.mean(numbers, axis=0)
 
-    still = np.eye(_ALL)[:, :_STILL]
-    none = fit(still)[0]
+    sharp = np.eye(_ALL)[:, :_SHARP]
+    none = fit(sharp)[0]
     if none <= 0.0:
-        return NO_EVIDENCE
-    sxx, sxy, syy = fit(np.eye(_ALL))[1][_STILL:]
+        return NONE_MISSING
+    sxx, sxy, syy = fit(np.eye(_ALL))[1][_SHARP:]
     x, y = np.linalg.eigh([[sxx, sxy], [sxy, syy]])[1][:, 1]
     (line, along), (disc, round_) = (
-        fit(np.column_stack([still, [0.0, 0.0, 0.0, 0.0, *moments]]))
+        fit(np.column_stack([sharp, [0.0, 0.0, 0.0, 0.0, *moments]]))
         for moments in ((x * x, x * y, y * y), (1.0, 0.0, 1.0))
     )
-    return BlurEvidence(
+    return MissingBlur(
         1.0 - line / none,
         float(pixel**2 * (along[4] + along[6])),
         math.atan2(y, x),

@@ -1,4 +1,4 @@
-"""Search for the motion or the defocus under which the render looks like the raw frame.
+"""Search for the motion or the defocus under which the render looks like the frame image.
 
 Motions are found by Levenberg-Marquardt with Huber weights, discs of defocus by a pattern search, both from
 coarse to fine.
@@ -44,7 +44,7 @@ NARROWING = (0.25, 0.12, 0.06)
 """Steps of the pattern search for a disc, as shares of its radius and of the range of nearness."""
 
 MODEL_PENALTY = 0.005
-"""Share of the misfit that each further motion must explain to be preferred to a simpler model."""
+"""Share of the residual that each further motion must explain to be preferred to a simpler model."""
 
 DAMPING, MORE_DAMPING = 1e-2, 6.0
 DAMPING_FLOOR = 1e-4
@@ -56,7 +56,7 @@ MAX_TRIES = 4
 MAX_ORDER = 3
 """Highest order of a path in time."""
 ORDER_PENALTY = 0.005
-"""Share of the misfit without any motion that each further order of the path must explain to be preferred."""
+"""Share of the residual without any motion that each further order of the path must explain."""
 
 BEND_SHARE = 0.01
 """Share of the difference that a path must explain at a size before a cubic path is tried at that size. Most
@@ -82,31 +82,31 @@ def search(
     """
     levels = [Level(pair, scale) for scale in scales(pair)]
     coarse = levels[0]
-    still = replace(held or FrameMotion(), median_depth=coarse.median)
+    no_motion = replace(held or FrameMotion(), median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew and held is None else ("blur",)
-    starts = _starts(coarse, still) if start is None else _near(coarse, still, start)
+    starts = _starts(coarse, no_motion) if start is None else _near(coarse, no_motion, start)
     begun = _best(coarse, starts, models[0], LEVELS[0][1], pose)
-    found: list[tuple[Model, FrameMotion]] = [("none", still)]
+    found: list[tuple[Model, FrameMotion]] = [("none", no_motion)]
     for model in models:
-        straight = curved = _restricted(begun, model, still)
+        straight = curved = _restricted(begun, model, no_motion)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
-            nearer = min((straight, still), key=level.cost)
+            nearer = min((straight, no_motion), key=level.cost)
             straight = _best(level, [nearer], model, steps, pose)
-            best = _promising(level, [straight, curved], still) if BLUR in _ACTIVE[model] else None
+            best = _promising(level, [straight, curved], no_motion) if BLUR in _ACTIVE[model] else None
             if best is not None and level is not levels[-1]:
                 curved = _best(level, [best], model, steps, pose, MAX_ORDER)
         found.append((model, straight))
         if best is not None and (straight.blur.any() or curved.blur.any()):
             paths = [_best(level, [straight], model, steps, pose, 2)]
-            if (best := _promising(level, [*paths, curved], still)) is not None:
+            if (best := _promising(level, [*paths, curved], no_motion)) is not None:
                 paths.append(_best(level, [best], model, steps, pose, MAX_ORDER))
             found += [(model, path) for path in paths]
     if defocus:
-        disc = _sharpest_disc(coarse, still)
+        disc = _sharpest_disc(coarse, no_motion)
         for level in levels[1:]:
             disc = _narrowed(level, disc)
         found.append(("defocus", disc))
-    return [levels[-1].evaluate(named(model, still), motion) for model, motion in found]
+    return [levels[-1].evaluate(named(model, no_motion), motion) for model, motion in found]
 
 
 def named(model: Model, motion: FrameMotion) -> Model:
@@ -122,8 +122,8 @@ def measured_fits(pair: FramePair, motions: Sequence[FrameMotion]) -> list[Motio
     """
     level = finest_level(pair)
     best = min(motions, key=level.cost)
-    still = np.zeros(TWIST)
-    paths = [best, replace(best, pose=still, bend=still, cube=still)]
+    none = np.zeros(TWIST)
+    paths = [best, replace(best, pose=none, bend=none, cube=none)]
     return [level.evaluate(named("blur", path), path) for path in paths]
 
 
@@ -152,7 +152,7 @@ def corrected(pair: FramePair, motion: FrameMotion, measured: Measurement, *, po
     unknowns = np.hstack([np.eye(len(active))[:, :TWIST], to_speed]) if pose else to_speed
     total = measured.exposure**2 + measured.readout**2
     speed = (measured.exposure * motion.blur + measured.readout * motion.skew) / total
-    variance = (1.25 * level.evaluate("blur", motion).misfit) ** 2  # if errors are normal
+    variance = (1.25 * level.evaluate("blur", motion).residual) ** 2  # if errors are normal
     held = np.zeros((unknowns.shape[1], unknowns.shape[1]))
     held[-TWIST:, -TWIST:] = SHARED_PIXELS * variance * measured.precision
     before = np.concatenate([np.zeros(unknowns.shape[1] - TWIST), speed - measured.speed])
@@ -180,7 +180,7 @@ def refine(
     level = finest_level(pair)
     if model == "none":
         return [level.evaluate("none", FrameMotion())]
-    still = FrameMotion(median_depth=level.median)
+    no_motion = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
         paths = [_narrowed(level, motion)]
@@ -189,28 +189,28 @@ def refine(
         paths = [_best(level, [motion], model, WARM_STEPS, pose, order)]
         if curve and order < MAX_ORDER and BLUR in _ACTIVE[model]:
             paths.append(_best(level, paths, model, WARM_STEPS, pose, order + 1))
-    return [level.evaluate("none", still), *(level.evaluate(model, path) for path in paths)]
+    return [level.evaluate("none", no_motion), *(level.evaluate(model, path) for path in paths)]
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
-    """Return the fit with the least misfit, with penalties for further motions and orders of the path."""
+    """Return the fit with the least residual, with penalties for further motions and orders of the path."""
 
     def cost(fit: MotionFit) -> float:
-        model = fit.misfit * (1.0 + MODEL_PENALTY * _PARTS[fit.model])
-        return model + ORDER_PENALTY * fit.misfit_still * (fit.motion.order - 1)
+        model = fit.residual * (1.0 + MODEL_PENALTY * _PARTS[fit.model])
+        return model + ORDER_PENALTY * fit.residual_without * (fit.motion.order - 1)
 
     return min(found, key=cost)
 
 
-def _promising(level: Level, paths: list[FrameMotion], still: FrameMotion) -> FrameMotion | None:
+def _promising(level: Level, paths: list[FrameMotion], no_motion: FrameMotion) -> FrameMotion | None:
     """Return the best of ``paths``; None if it explains less than `BEND_SHARE` at this size."""
     costs = [level.cost(path) for path in paths]
-    enough = min(costs) < (1.0 - BEND_SHARE) * level.cost(still)
+    enough = min(costs) < (1.0 - BEND_SHARE) * level.cost(no_motion)
     return paths[costs.index(min(costs))] if enough else None
 
 
-def _restricted(motion: FrameMotion, model: Model, still: FrameMotion) -> FrameMotion:
-    vector = still.vector
+def _restricted(motion: FrameMotion, model: Model, no_motion: FrameMotion) -> FrameMotion:
+    vector = no_motion.vector
     for part in (POSE, *_ACTIVE[model]):
         vector[part] = motion.vector[part]
     return motion.with_vector(vector)
@@ -236,23 +236,23 @@ def _best(
     return min(ends, key=level.cost)
 
 
-def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
+def _starts(level: Level, no_motion: FrameMotion) -> list[FrameMotion]:
     """Return the best of a grid of rotations about the camera's x and y axes, a short blur and no motion."""
     pixel = 1.0 / level.scale
     motions = [
-        replace(still, blur=_rotation(length * pixel, math.pi * k / DIRECTIONS))
+        replace(no_motion, blur=_rotation(length * pixel, math.pi * k / DIRECTIONS))
         for length in LENGTHS
         for k in range(DIRECTIONS)
     ]
     costs = [level.cost(motion, COARSE) for motion in motions]
     first = [motions[k] for k in np.argsort(costs, kind="stable")[:STARTS]]
-    return [*first, _short(level, still), still]
+    return [*first, _short(level, no_motion), no_motion]
 
 
-def _near(level: Level, still: FrameMotion, start: FrameMotion) -> list[FrameMotion]:
+def _near(level: Level, no_motion: FrameMotion, start: FrameMotion) -> list[FrameMotion]:
     """Return ``start``, a short blur and no motion."""
-    start = replace(start, median_depth=still.median_depth)
-    return [*([start] if start.blur.any() else []), _short(level, start), still]
+    start = replace(start, median_depth=no_motion.median_depth)
+    return [*([start] if start.blur.any() else []), _short(level, start), no_motion]
 
 
 def _short(level: Level, motion: FrameMotion) -> FrameMotion:
@@ -265,14 +265,14 @@ def _short(level: Level, motion: FrameMotion) -> FrameMotion:
     return replace(motion, blur=0.5 / level.scale * blur)
 
 
-def _sharpest_disc(level: Level, still: FrameMotion) -> FrameMotion:
+def _sharpest_disc(level: Level, no_motion: FrameMotion) -> FrameMotion:
     """Return the best of a grid of discs."""
     low, middle, high = (float(q) for q in np.quantile(level.nearness, (0.05, 0.5, 0.95)))
     discs = []
     for focus in (0.0, low, middle, high, 2.0 * high):
         spread = float(np.abs(level.nearness - np.float32(focus)).mean(dtype=np.float64))
         for radius in RADII:
-            discs.append(replace(still, disc_px=radius / level.scale / max(spread, 1e-3), focus=focus))
+            discs.append(replace(no_motion, disc_px=radius / level.scale / max(spread, 1e-3), focus=focus))
     return min(discs, key=lambda disc: level.cost(disc, DISC))
 
 

@@ -1,10 +1,10 @@
 """Detection of a rolling shutter in a capture, and the skew that all its frames have in common.
 
 A scene can absorb a skew that all frames share: a walk around a table with a rolling shutter looks like one
-with a still shutter around a table that is twisted about its axis. The poses distinguish the two. The readout
-takes the same time in every frame, so a frame's skew is that time multiplied by the speed of the camera at
-the frame, plus the hand's tremor. Skew and speed vary from frame to frame. The slope of the skew over the
-speed is the readout time. The mean skew is the readout time multiplied by the mean speed.
+with a global shutter around a table that is twisted about its axis. The poses distinguish the two. The
+readout takes the same time in every frame, so a frame's skew is that time multiplied by the speed of the
+camera at the frame, plus the hand's tremor. Skew and speed vary from frame to frame. The slope of the skew
+over the speed is the readout time. The mean skew is the readout time multiplied by the mean speed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from cleargs.splat.views import TrainingView
 from cleargs.types import ArrayF64
 
 ROLLING = 0.015
-"""Share of the misfit that a rolling shutter must explain in addition to all else, in half of a capture's
+"""Share of the residual that a rolling shutter must explain in addition to all else, in half of a capture's
 frames. Source: measurements in docs/formation.md."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
@@ -116,8 +116,8 @@ def with_skew(frame: FrameFormation, twist: ArrayF64) -> FrameFormation:
         return frame
     added = twist / _scale(frame.motion.median_depth)
     motion = replace(frame.motion, skew=frame.motion.skew + added)
-    reach = frame.reach_px + 0.5 * float(np.abs(added).sum())
-    return replace(frame, model=WITH_SKEW[frame.model], motion=motion, reach_px=reach)
+    displacement = frame.displacement_px + 0.5 * float(np.abs(added).sum())
+    return replace(frame, model=WITH_SKEW[frame.model], motion=motion, displacement_px=displacement)
 
 
 def _scale(median_depth: float) -> ArrayF64:  # [6]

@@ -24,35 +24,34 @@ _TWISTS = {
 
 def _component(name: str, axis: str) -> pa.Field:
     text = f"{axis} of the scene past the camera{_TWISTS[name]}, px: t times fx / median depth, r times fx"
-    return column(f"{name}_{axis}", pa.float64(), text, nullable=name in ("bend", "cube", "skew_bend"))
+    return column(f"{name}_{axis}", pa.float64(), text)
 
 
 FORMATION = pa.schema(
     [
         column("frame_id", pa.int32(), "active frame"),
-        column("draws", pa.int64(), "steps since the first estimate of the formation", nullable=True),
+        column("steps", pa.int64(), "steps since the first estimate of the formation"),
         column("model", pa.string(), "none, blur, skew, both (blur and skew) or defocus"),
-        column("order", pa.int32(), "order of the path: 1 straight, 2 quadratic, 3 cubic", nullable=True),
+        column("order", pa.int32(), "order of the path: 1 straight, 2 quadratic, 3 cubic"),
         column("blur_px", pa.float64(), "mean length of the pixels' paths during the exposure, px"),
         column(
             "skew_px", pa.float64(), "mean length of the paths from the first row's time to the last's, px"
         ),
         column("defocus_px", pa.float64(), "mean radius of the discs of defocus, px"),
-        column("reach_px", pa.float64(), "distance from a pixel to what it shows: 95 % quantile, px"),
-        column("explained", pa.float64(), "share of the frame's misfit that the model removes"),
-        column("misfit", pa.float64(), "mean difference of high-passed linear luminance with the model"),
-        column("misfit_still", pa.float64(), "the same difference without the model"),
+        column("displacement_px", pa.float64(), "distance from a pixel to what it shows: 95 % quantile, px"),
+        column("explained", pa.float64(), "share of the frame's residual that the model removes"),
+        column("residual", pa.float64(), "mean difference of high-passed linear luminance with the model"),
+        column("residual_without", pa.float64(), "the same difference without the model"),
         column(
             "skew_gain",
             pa.float64(),
-            "share of the misfit that a rolling shutter explains beyond blur and defocus",
+            "share of the residual that a rolling shutter explains beyond blur and defocus",
             nullable=True,
         ),
         column(
-            "evidence",
+            "blur_gain",
             pa.float64(),
             "least share of the squared error that further blur explained since the last search",
-            nullable=True,
         ),
         column("weight_before", pa.float64(), "RVA's weight of the frame"),
         column("weight_after", pa.float64(), "weight of the frame at the end of the training"),
@@ -66,20 +65,14 @@ FORMATION = pa.schema(
             "exposure_s",
             pa.float64(),
             "exposure time, s, of a blur that is the measured motion during it; 0: the blur was searched",
-            nullable=True,
         ),
-        column(
-            "columns",
-            pa.bool_(),
-            "true if the columns are read one after the other, not the rows",
-            nullable=True,
-        ),
+        column("columns", pa.bool_(), "true if the columns are read one after the other, not the rows"),
     ]
 )
 
 
 def write_formation(path: Path, formation: CaptureFormation, weights: Mapping[int, float]) -> None:
-    """Write ``formation.parquet``. ``weights`` are RVA's weights of the raw frames, by frame_id."""
+    """Write ``formation.parquet``. ``weights`` are RVA's weights of the frames, by frame_id."""
     rows = [
         as_row(frame)
         | {

@@ -1,4 +1,4 @@
-"""The linear operator B of a frame, from a still image to its photograph in linear light, and Bᵀ."""
+"""The linear operator B of a frame, from a sharp image to the frame image in linear light, and Bᵀ."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def displacement_fields(
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """B for one frame. The image is larger than the photograph by ``margin`` pixels on every side.
+    """B for one frame. The image is larger than the frame image by ``margin`` pixels on every side.
 
     A long blur is computed in two passes: samples some pixels apart, then the mean over the path from one to
     the next (``between``). So 30 samples cost 6 + 5. The result is the same if all pixels have equal blur.

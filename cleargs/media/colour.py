@@ -15,6 +15,9 @@ F = TypeVar("F", np.float32, np.float64)
 LUMA = {"bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722), "bt2020": (0.2627, 0.0593)}
 """Kr and Kb of each YCbCr matrix (ITU-R BT.601, BT.709, BT.2020)."""
 
+TRANSFERS = {16: "pq", 18: "hlg"}
+"""HDR transfer functions by their codes in files (ITU-T H.273)."""
+
 REC709_FROM_REC2020 = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]]
 )

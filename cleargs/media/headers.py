@@ -28,7 +28,7 @@ class Header(NamedTuple):
     deep: bool
     """True if the image has one channel of more than 8 bits, as depth maps have."""
     spectral: bool = False
-    """True if it is a TIFF file of several channels that Pillow cannot read, as of spectral bands."""
+    """True if it is a TIFF file of other channels than colours: spectral bands, or Lab."""
 
 
 def read_header(path: Path) -> Header | None:
@@ -44,7 +44,7 @@ def read_header(path: Path) -> Header | None:
                 pillow_heif.register_heif_opener()
             with Image.open(path) as image:
                 deep = image.mode.startswith(("I", "F"))
-                return Header(image.size, image.mode in _GREY, deep)
+                return Header(image.size, image.mode in _GREY, deep, image.mode == "LAB")
     return _spectral_header(path) if path.suffix.lower() in (".tif", ".tiff") else None
 
 

@@ -16,6 +16,7 @@ from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import MAX_PIXELS
+from cleargs.media.colour import TRANSFERS, srgb_from_hdr
 from cleargs.safe_io import FAULTS, cause, faults_as, open_regular
 from cleargs.types import AnyImage, ImageF32, ImageU8, MaskU8
 
@@ -27,6 +28,8 @@ _HEIC = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1"
 _JXL = (b"\xff\x0a", b"\0\0\0\x0cJXL ")  # first bytes of JPEG XL files (ISO/IEC 18181-2)
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
+
+_NCLX = b"colrnclx"  # in HEIC and AVIF files, before the codes of primaries and transfer (ISO/IEC 14496-12)
 
 _METADATA = 2**18  # bytes at the start of a file that are searched for metadata
 
@@ -108,15 +111,22 @@ def image_size(path: Path) -> tuple[int, int]:
 def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
     """Return the image in ``path`` as 8-bit sRGB [H, W, 3].
 
-    Alpha is dropped, 16 bits are reduced to 8, and an ICC profile is converted to sRGB. With ``upright``, the
-    image is turned by its EXIF orientation. Raises InputError if there is no readable image, or if it has
-    more than `MAX_PIXELS`.
+    Alpha is dropped, 16 bits are reduced to 8, an ICC profile is converted to sRGB, and HDR is tone-mapped.
+    With ``upright``, the image is turned by its EXIF orientation. Raises InputError if there is no readable
+    image, if it holds other numbers than colours, or if it has more than `MAX_PIXELS`.
     """
     with _decoded(path, upright=upright) as image:
+        if image.mode in ("F", "I"):
+            raise InputError(
+                f"{path} holds measured numbers, not colours",
+                hint="export it from its program as a PNG or TIFF of 8 or 16 bits",
+            )
         eight = _grey(image) if image.mode.startswith("I;16") else image
         profile = image.info.get("icc_profile")
         made = _srgb_from_profile(eight, profile) if profile else None
-        return np.array(eight.convert("RGB") if made is None else made)
+        rgb = np.array(eight.convert("RGB") if made is None else made)
+        transfer = None if profile else _hdr_transfer(path, image)
+        return rgb if transfer is None else to_uint8(srgb_from_hdr(to_float32(rgb), transfer))
 
 
 def read_mask(path: Path, turn: int = 1) -> MaskU8:  # [H, W]
@@ -292,6 +302,21 @@ def _grey(image: Image.Image) -> Image.Image:
     return image.convert("L")
 
 
+def _hdr_transfer(path: Path, image: Image.Image) -> str | None:
+    """Return ``pq`` or ``hlg`` for a HEIC or AVIF picture of HDR, else None.
+
+    Pillow does not read the colours of an AVIF file. A file with a map of gains has those of its HDR version
+    too, but its picture is that for usual displays.
+    """
+    code = (image.info.get("nclx_profile") or {}).get("transfer_characteristics")
+    if path.suffix.lower() in (".avif", ".avifs"):
+        with open_regular(path) as file:
+            head = file.read(_METADATA)
+        place = -1 if b"tmap" in head else head.find(_NCLX)
+        code = int.from_bytes(head[place + len(_NCLX) + 2 :][:2], "big") if place >= 0 else None
+    return TRANSFERS.get(code or 0)
+
+
 def _srgb_from_profile(image: Image.Image, profile: bytes) -> Image.Image | None:
     """Return ``image`` converted from its ICC ``profile`` to sRGB, relative colorimetric.
 
@@ -300,7 +325,7 @@ def _srgb_from_profile(image: Image.Image, profile: bytes) -> Image.Image | None
     """
     with suppress(ImageCms.PyCMSError, *_FAULTS):
         source = ImageCms.getOpenProfile(io.BytesIO(profile))
-        mode = {"RGB": "RGB", "GRAY": "L"}[source.profile.xcolor_space.strip()]
+        mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[source.profile.xcolor_space.strip()]
         if mode != "RGB" and image.mode != mode:
             return None
         srgb, how = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC

@@ -26,13 +26,12 @@ from av.video.stream import VideoStream
 
 from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
-from cleargs.media.colour import rgb_from_yuv, srgb_from_hdr
+from cleargs.media.colour import TRANSFERS, rgb_from_yuv, srgb_from_hdr
 from cleargs.media.image import to_uint8
 from cleargs.safe_io import open_regular
 from cleargs.types import ImageF32, ImageU8
 
 _MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
-_TRANSFERS = {16: "pq", 18: "hlg"}
 _FULL_RANGE = 2
 _PREVIEW = 0.1
 _PROGRESSIVE = 1  # AVFieldOrder: 0 is unknown, above 1 are those of two fields
@@ -99,7 +98,7 @@ def read_timeline(path: Path) -> Timeline:
             lacks &= left * len(pts) > _LAST_FRAMES * (end - min(pts))
         if short or lacks:
             raise _broken(path, len(pts), stream)
-        transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
+        transfer = TRANSFERS.get(int(stream.codec_context.color_trc))
         interlaced = int(stream.codec_context.field_order) > _PROGRESSIVE
         others = len(_by_merit(path)) - 1 if len(container.streams.video) > 1 else 0
         return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer, interlaced, others)
@@ -225,7 +224,7 @@ def _signal(frame: VideoFrame) -> ImageF32:  # [H, W, 3]
         int(frame.colorspace), "bt709" if min(frame.width, frame.height) >= 720 else "bt601"
     )
     rgb = rgb_from_yuv(yuv, matrix, 8 if bits == 8 else 16, full_range=full)
-    transfer = _TRANSFERS.get(int(frame.color_trc))
+    transfer = TRANSFERS.get(int(frame.color_trc))
     return rgb if transfer is None else srgb_from_hdr(np.clip(rgb, 0, 1), transfer)
 
 

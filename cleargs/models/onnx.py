@@ -24,6 +24,10 @@ from cleargs.plugins import installed_version
 from cleargs.safe_io import faults_as, read_bytes
 from cleargs.types import AnyArray, ArrayF32, Device
 
+os.environ.setdefault(
+    "ORT_DISABLE_TELEMETRY", "1"
+)  # else onnxruntime 1.29 and later sends facts about its use
+
 CUDA_PROVIDER = "CUDAExecutionProvider"
 
 BATCH_PIXELS = 8 * 512 * 512

@@ -18,7 +18,7 @@ from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.own_files import nodes_below
 from cleargs.pipeline.store import writer_is_alive
-from cleargs.progress import COMPILING, PREVIEW, ForwardingTask, Reporter, Task
+from cleargs.progress import COMPILING, PREVIEW, BothTasks, CountedTask, Reporter, Task
 from cleargs.safe_io import FAULTS, read_json
 from cleargs.timing import timed
 
@@ -171,7 +171,7 @@ class RecordingReporter:
         if total is None:  # nothing may come until its end
             self.write()
         with timed(label), self._reporter.task(label, total) as task:
-            yield ForwardingTask(task, total, show)
+            yield BothTasks(task, CountedTask(total, show))
         if label == COMPILING:
             self.compile_seconds += time.monotonic() - begun
 

@@ -23,6 +23,7 @@ from cleargs.manifest import (
     Manifest,
     damages,
     has_results,
+    hidden_link,
     last_shown,
     plain_json,
     published_files,
@@ -108,7 +109,7 @@ class Runner(Planner):
                     self._revise([plan for plan in plans if plan.stage not in done], done, made)
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
-            if os.path.lexists(self.run.folder / SCENE) and not self._has_scene_link():
+            if os.path.lexists(self.run.folder / SCENE) and not self._is_own_scene():
                 self.reporter.warn(f"{self.run.folder / SCENE} was not made by ClearGS, and is not the scene")
         return outcomes
 
@@ -124,20 +125,22 @@ class Runner(Planner):
         done = [name for name in self.dag.names if has_results(folder, name)]
         targets = [Path(name, SCENE) for name in done if (folder / name / SCENE).is_file()]
         with disk_errors(link):
-            copied = any(copied_key(folder / name) for name in self.dag.names)  # a disk without links
-            if (self._has_scene_link() and link.readlink() not in targets[-1:]) or (
-                copied
-                and link.is_file()
-                and (not targets or not cmp(link, folder / targets[-1], shallow=False))
-            ):
+            if link.is_symlink():
+                current = link.readlink() in targets[-1:]
+            else:
+                current = any(_is_same(link, folder / target) for target in targets[-1:])
+            if not current and self._is_own_scene():
                 link.unlink()
-            if targets and not link.is_symlink() and not link.exists():
+            if targets and not os.path.lexists(link):
                 link_or_copy(targets[-1], link)
 
-    def _has_scene_link(self) -> bool:
-        """Return True if ``RUN/scene.ply`` is a link that ClearGS made."""
-        link = self.run.folder / SCENE
-        return link.is_symlink() and link.readlink() in [Path(name, SCENE) for name in self.dag.names]
+    def _is_own_scene(self) -> bool:
+        """Return True if ``RUN/scene.ply`` is a link of ClearGS, or a copy, on a disk without links."""
+        folder, scene = self.run.folder, self.run.folder / SCENE
+        if scene.is_symlink():
+            return scene.readlink() in [Path(name, SCENE) for name in self.dag.names]
+        places = [place for name in self.dag.names for place in (folder / name, hidden_link(folder, name))]
+        return any(copied_key(place) and _is_same(scene, place / SCENE) for place in places)
 
     def _revise(
         self, plans: Sequence[StagePlan], done: Mapping[str, Manifest], made: Mapping[str, Manifest]
@@ -317,6 +320,10 @@ class Runner(Planner):
         changed = manifest.model_copy(update={"inherited": inherited, "status": status})
         write_manifest(self.store.folder(manifest.stage, manifest.key), changed)
         return changed
+
+
+def _is_same(file: Path, other: Path) -> bool:
+    return file.is_file() and other.is_file() and cmp(file, other, shallow=False)
 
 
 def check_same_input(run: RunSpec, dag: Stages, store: Store) -> None:

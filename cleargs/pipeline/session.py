@@ -10,7 +10,7 @@ from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError, listed
-from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
+from cleargs.gpu import NO_GPU, Machine
 from cleargs.packed import require_images
 from cleargs.pipeline.config import check_document, known_settings, load_config
 from cleargs.pipeline.run_file import (
@@ -40,17 +40,30 @@ def usable_cores() -> int:
 
 
 def resolve_device(
-    choice: DeviceChoice, say: Callable[[str], None], *, kept: Device | None = None, test: bool = False
+    choice: DeviceChoice,
+    say: Callable[[str], None],
+    *,
+    kept: Device | None = None,
+    test: bool = False,
+    machine: Machine | None = None,  # None: this one
 ) -> Device:
-    """Return the device to use. Does not import torch, which would take seconds.
+    """Return the device to use, without an import of torch, which would take seconds.
 
-    ``auto`` keeps the device of an existing run (``kept``). Otherwise it uses a GPU that passed its self-test
-    and is faster than the CPU, and reports the reason to ``say``. With ``test``, it runs the self-test of a
-    GPU that was not tested yet. Raises InputError if the chosen or kept device is a GPU that cannot be used.
+    | choice | of the run (``kept``) | device |
+    |---|---|---|
+    | cpu | any | CPU |
+    | cuda | any | GPU |
+    | auto | cpu | CPU |
+    | auto | cuda | GPU; InputError if it failed its self-test |
+    | auto | none | GPU if it passed its self-test and is faster, else CPU; the reason goes to ``say`` |
+
+    With ``test``, a GPU that was not tested yet is tested. Raises InputError if a GPU in the table cannot be
+    used.
     """
     if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
-    obstacle = cuda_obstacle()
+    machine = machine or Machine()
+    obstacle = machine.obstacle()
     if obstacle is not None and (choice == "cuda" or kept == "cuda"):
         raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")
     if choice == "cuda":
@@ -59,8 +72,8 @@ def resolve_device(
         if obstacle != NO_GPU:
             say(f"device: the CPU, because {obstacle}")
         return "cpu"
-    facts = current_facts()
-    tested = cached_test(facts) or (self_test(facts, say) if test else None)
+    facts = machine.facts()
+    tested = machine.cached_test(facts) or (machine.self_test(facts, say) if test else None)
     if kept == "cuda":
         if tested is not None and tested.fault is not None:
             raise InputError(

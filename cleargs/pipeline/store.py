@@ -286,7 +286,7 @@ class Store:
         link = run / stage
         if link.is_symlink() and link.readlink() == target:
             return
-        if (copied := copied_key(link)) == key:
+        if (copied := copied_key(link)) == key and self._is_whole(link):
             return
         if link.exists() and not link.is_symlink() and copied is None:
             raise StoreError(
@@ -304,6 +304,13 @@ class Store:
                 remove(link)
             temporary.replace(link)
             remove(hidden_link(run, stage))
+
+    def _is_whole(self, copy: Path) -> bool:
+        """Return True if the files of a copy are those of its manifest: a disk may have been unplugged."""
+        with suppress(OSError, ValueError):
+            manifest = read_manifest(copy)
+            return not any(damages(copy, manifest, manifest.files, self.memo))
+        return False
 
     def unlink(self, run: Path, stage: str) -> None:
         """Remove the link ``RUN/<stage>``. The results stay in the store; `last_shown` still finds them."""

@@ -13,18 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Similarity, upright
-from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
 from cleargs.files import disk_errors, write_json
-from cleargs.manifest import linked_manifest
 from cleargs.named_views import read_views
 from cleargs.pipeline.outputs import check_outputs
 from cleargs.pipeline.stages import installed
 from cleargs.progress import Reporter
 from cleargs.render.pruning import crop_scene, drop_spheres, parse_crop, parse_drop, parse_prune, prune_scene
 from cleargs.render.sidecars import stem, views_json, write_sidecars
-from cleargs.run_results import edited_scene, scene_path
+from cleargs.run_results import edited_scene, scene_origin, scene_path
 from cleargs.scene.views import camera_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.formats import check_up, format_of, padded, read_scene, write_scene
@@ -111,7 +109,8 @@ def export_scene(
     if similarity:
         eyes = similarity["scale"] * eyes @ similarity["rotation"].T + similarity["translation"]
     files = dict(zip(outputs, kinds, strict=True))
-    source = f"scene of {stage}" if options.scene is None else str(options.scene)
+    origin = scene_origin(installed(), run, stage)
+    source = f"scene of {origin}" if options.scene is None else str(options.scene)
     written = _write(scene, files, options, f"{source}, {axes}", eyes)
     return [*messages, *cropped, *written]
 
@@ -217,8 +216,7 @@ def _similarity(
     """Return the similarity from the world of the run to that of the files; {} for the identity."""
     similarity: dict[str, Any] = {}
     if options.world == "input":
-        manifest = linked_manifest(ingest.parent, ingest.name)
-        world = Similarity.from_json(IngestSummary.of(manifest).similarity, ingest)
+        world = Similarity.read(ingest)
         similarity = {"scale": world.scale, "rotation": world.rotation.T, "translation": world.origin}
     else:
         stand = np.eye(3) if options.upright is None else upright(_direction(options.upright, cameras))

@@ -34,14 +34,14 @@ class Shot:
 
     camera: Camera
     filmed: Path | None = None
-    """Raw frame to show on the left of the render."""
+    """Frame image to show on the left of the render."""
 
 
 class ShotRenderer(Viewer):
     """Renders shots of one scene."""
 
     def picture(self, shot: Shot) -> ImageU8:
-        """Render ``shot``. The image is twice as wide if the shot has a raw frame, which is on the left."""
+        """Render ``shot``. The image is twice as wide if the shot has a frame image, which is on the left."""
         rendered = self.view(shot.camera)
         if shot.filmed is None:
             return rendered

@@ -11,10 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
-from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
-from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
 from cleargs.packed import require_images
@@ -145,9 +143,7 @@ def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
     count = max(2, round(options.fps * (options.seconds or SECONDS)))
     filmed: list[Frame] = []
     if options.poses is not None:
-        manifest = linked_manifest(ingest.parent, ingest.name)
-        similarity = Similarity.from_json(IngestSummary.of(manifest).similarity, ingest)
-        cameras = read_poses(options.poses, lens, similarity, options.world)
+        cameras = read_poses(options.poses, lens, Similarity.read(ingest), options.world)
     elif options.turntable:
         cameras = [replace(lens, world_to_camera=pose) for pose in turntable(own, count)]
     elif options.frame is not None or kind == "still":

@@ -56,8 +56,8 @@ class FrameRow:
     formation: Mapping[str, Any] = field(default_factory=dict)
     """Column of ``formation.parquet`` of the last scene -> value; empty without one."""
     psnr: float | None = None
-    """Median PSNR, dB, of the last training steps on the raw frame, as its camera saw it; None if no training
-    used the frame."""
+    """Median PSNR, dB, of the last training steps on the frame image, as its camera saw it; None if no
+    training used the frame."""
     moving: MaskBool | None = None  # [rows, columns]
     """True for the cells of an even grid that the training ignored, because something moves there."""
     speed_px: float | None = None
@@ -72,13 +72,13 @@ class FrameRow:
 
     @property
     def weight(self) -> float | None:
-        """Weight of the raw frame at the end of the training, from 0 to 1; None if it is unknown."""
+        """Weight of the frame image at the end of the training, from 0 to 1; None if it is unknown."""
         weight: float | None = self.formation.get("weight_after", self.rated.get("weight"))
         return weight
 
     @property
     def weight_text(self) -> str:
-        """The weight of the raw frame in words, with its reason; "" if it is unknown."""
+        """The weight of the frame image in words, with its reason; "" if it is unknown."""
         if self.role in (UNPLACED, HELD_OUT):
             return f"{self.role}: not used"
         if self.weight is None:
@@ -206,7 +206,7 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
 
 
 def _last_psnr(logs: Sequence[pa.Table | None]) -> dict[int, float]:
-    """Return frame_id -> median PSNR of the last `LAST_STEPS` steps on the raw frame at its full size."""
+    """Return frame_id -> median PSNR of the last `LAST_STEPS` steps on the frame image at its full size."""
     steps: dict[int, list[tuple[int, float]]] = {}
     for table in filter(None, logs):
         columns = (table[name].to_pylist() for name in ("frame_id", "kind", "width", "psnr"))

@@ -16,7 +16,7 @@ from cleargs.report.frames import SCENES, FrameRow
 from cleargs.rivr.summaries import ConsolidateSummary, G0Summary, RepairSummary, TrainingSummary
 from cleargs.splat.config import steps_from_frames
 
-CLOSE_DB, LOOSE_DB = 28.0, 22.0
+GOOD_DB, FAIR_DB = 28.0, 22.0
 """PSNR from which the scene matches the frames closely, and below which it does so loosely. The PSNR of a
 good scene depends on the noise and the texture of the capture."""
 
@@ -51,7 +51,7 @@ def outcome(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen:
         trained = "g0" in manifests
         headline = "The scene is trained." if trained else "The capture is prepared. No scene is trained yet."
         return Outcome("fair", headline, text, "")
-    tone: Tone = "good" if psnr >= CLOSE_DB else "fair" if psnr >= LOOSE_DB else "poor"
+    tone: Tone = "good" if psnr >= GOOD_DB else "fair" if psnr >= FAIR_DB else "poor"
     filmed = any(row.frame.time_s is not None for row in rows)
     after = " after a short training" if short_training(manifests, rows) else ""
     headline = HEADLINES[tone].format(source="video" if filmed else "photographs", after=after)

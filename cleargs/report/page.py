@@ -15,7 +15,7 @@ from cleargs.program import program
 from cleargs.report.advice import command, shown_advice
 from cleargs.report.frames import MEANINGS, SCENES, FrameRow, load_rows, scene_with_models
 from cleargs.report.html import page_html
-from cleargs.report.outcome import LOOSE_DB, outcome
+from cleargs.report.outcome import FAIR_DB, outcome
 from cleargs.report.page_data import changed_settings, frame_data, training_curves
 from cleargs.report.pictures import LAYERS, write_jpeg, write_pictures
 from cleargs.report.report_json import (
@@ -106,7 +106,7 @@ def write_report(planner: Planner, edited: Path | None = None) -> Path:
                 "layers": {name: name for found in pictures.values() for name in found.layers} | LAYERS,
                 "meanings": MEANINGS,
                 "opening": {"left": "observed", "right": "final"},
-                "poor": LOOSE_DB,
+                "poor": FAIR_DB,
                 "program": f"{program(run.parent)} ",
                 "shellName": quote(run.name),
                 "start": opening_frame(placed).frame.frame_id if scene else None,

@@ -70,8 +70,8 @@ _POINTS = 120  # maximum number per curve
 def training_curves(run: Path, stages: Sequence[str]) -> dict[str, Any] | None:
     """Return loss, PSNR and number of Gaussians over the training steps; None before the first step.
 
-    Loss and PSNR are those of steps on raw frames. They are medians over equal intervals: each step shows one
-    view, and views differ more than steps. Raises StoreError if a table cannot be read.
+    Loss and PSNR are those of steps on frame images. They are medians over equal intervals: each step shows
+    one view, and views differ more than steps. Raises StoreError if a table cannot be read.
     """
     logs = {stage: SceneFolder(run / stage).log() for stage in stages}
     tables = {stage: log for stage, log in logs.items() if log is not None}

@@ -15,7 +15,7 @@ from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.metrics import psnr as psnr_of
 from cleargs.formation.frame import from_row
 from cleargs.formation.motion import pixel_paths
-from cleargs.formation.movement import still_pixels
+from cleargs.formation.movement import static_pixels
 from cleargs.media.exr import from_layer
 from cleargs.media.image import read_mask, read_rgb, reduced, to_uint8
 from cleargs.report.frames import HELD_OUT, FrameRow
@@ -128,7 +128,7 @@ def formed_layers(
 
 
 def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
-    """Return layer -> image [H, W, 3] sRGB: the raw frame, its moving parts, and layers of the latest round.
+    """Return layer -> image [H, W, 3] sRGB: the frame image, its moving parts, layers of the latest round.
 
     Raises InputError if an image cannot be read, and StoreError for the file of the layers.
     """
@@ -137,7 +137,7 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     if row.frame.mask and not (used := read_mask(run / "ingest" / row.frame.mask) > 0).all():
         images["masked"] = _tinted(observed, used)
     if row.moving is not None:
-        images["moving"] = _tinted(observed, still_pixels(row.moving, *observed.shape[:2]))
+        images["moving"] = _tinted(observed, static_pixels(row.moving, *observed.shape[:2]))
     if row.selection is not None and row.selection.exr is not None:
         stored = row.selection.layers(run / "rivr")
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}
@@ -173,7 +173,7 @@ def _write_frame(
 
 
 def _aligned_psnr(render: ImageU8, observed: ImageU8) -> float | None:
-    """Return the PSNR, dB, of a render against the raw frame, after the best affine change of its colours."""
+    """Return the PSNR, dB, of a render against the frame image, after the best affine change of colours."""
     height, width = render.shape[:2]
     reference = np.asarray(cv2.resize(observed, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     image, target = render / 255.0, reference / 255.0

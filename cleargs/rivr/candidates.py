@@ -1,6 +1,6 @@
 """The candidates of a target frame t (the paper's Table "RIVR candidates"), and the choice between them.
 
-`CANDIDATES` has one entry for each. O_t is the raw frame. Images are [H, W, 3] float32 sRGB in [0, 1].
+`CANDIDATES` has one entry for each. O_t is the frame image. Images are [H, W, 3] float32 sRGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 from cleargs.plugins import load_plugin
 from cleargs.types import ArrayF64, ImageF32
 
-Source: TypeAlias = Literal["observation", "deblurred", "render"]
+Source: TypeAlias = Literal["observed", "deblurred", "render"]
 """Image that the expert restored to D_t: O_t, O_t without the camera's motion, or R_t."""
 
 Scores: TypeAlias = Mapping[str, float]
 """Candidate, or `OBSERVED` -> its score, 0-100, higher is better."""
 
 OBSERVED = "observed"
-"""Name of the raw frame O_t among the choices and the layers of an EXR."""
+"""Name of the frame image O_t among the choices and the layers of an EXR."""
 
 
 class Materials(NamedTuple):
@@ -73,7 +73,7 @@ EXPLAINED = "explained: "
 """Prefix of the reason in a row whose frame image formation explains."""
 
 KEPT = "needs no repair"
-"""Reason in a row whose raw frame is kept."""
+"""Reason in a row whose frame image is kept."""
 
 MASKED = "every pixel of the frame is masked"
 """Reason in a row without a usable pixel."""
@@ -120,20 +120,20 @@ class Decision:
     """The supervision of a frame."""
 
     chosen: str
-    """A candidate, or `OBSERVED`: the raw frame."""
+    """A candidate, or `OBSERVED`: the frame image."""
     accepted: bool
     """True if the chosen candidate becomes a pseudo observation."""
     reason: str
 
 
 def decide(
-    primary: Scores,  # scores of the candidates, and of the raw frame if it may be kept
+    primary: Scores,  # scores of the candidates, and of the frame image if it may be kept
     tiebreak: Scores,
     margin: float,
     *,
     masked: bool = False,  # True if no pixel of the frame counts
     explained: str | None = None,  # the effect that explains the frame; None: none does, or not well enough
-    negligible: bool = False,  # True if the repair changes so little that an unbeaten raw frame is kept
+    negligible: bool = False,  # True if the repair changes so little that an unbeaten frame image is kept
     refused: str | None = None,  # why a gate refuses the restored frame
 ) -> Decision:
     """Decide what supervises a frame; the first row that holds gives the reason.
@@ -141,8 +141,8 @@ def decide(
     | case | chosen | accepted |
     |---|---|---|
     | masked | as in the rows below | no |
-    | explained, and it may be kept | raw frame | no |
-    | negligible, no score beats the raw frame's by more than ``margin`` | raw frame | no |
+    | explained, and it may be kept | frame image | no |
+    | negligible, no score beats the frame image's by more than ``margin`` | frame image | no |
     | refused | render: all other candidates contain the refused repair | yes |
     | else | highest primary score; the tie-break decides within ``margin`` of it | yes |
 
@@ -170,7 +170,7 @@ def decide(
 
 
 def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF32) -> bool:
-    """Return True if the repair changes little of the raw frame: |D - O|^2 < 0.15 |R - O|^2.
+    """Return True if the repair changes little of the frame image: |D - O|^2 < 0.15 |R - O|^2.
 
     A blurred or skewed frame differs from a good scene's render by the blur or the skew, and its repair
     removes much of that. In a sharp frame the difference is an error of the scene, and a repair that follows

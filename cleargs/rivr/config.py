@@ -18,19 +18,19 @@ class RepairConfig(FrozenModel):
     )
     keep_raw: bool = Field(
         True,
-        description="a raw frame that needs no repair is trained on as filmed; false: every target frame "
+        description="a frame image that needs no repair is trained on as filmed; false: every target frame "
         "gets a pseudo observation, as in the paper",
     )
     fuse_sigma: float = Field(
         2.0, gt=0.0, le=100.0, description="Gaussian that splits detail from base in the fusion, px"
     )
     use_observation: bool = Field(
-        True, description="false: the ablation whose expert restores the render instead of the raw frame"
+        True, description="false: the ablation whose expert restores the render instead of the frame image"
     )
     undo_motion: bool = Field(
         True,
-        description="with use_observation: undo the blur and the skew of the camera's motion in the raw "
-        "frame before the expert restores it; false: the expert restores the raw frame, as in the paper",
+        description="with use_observation: undo the blur and the skew of the camera's motion in the frame "
+        "image before the expert restores it; false: the expert restores the frame image, as in the paper",
     )
     candidates: tuple[str, ...] = Field(
         (),

@@ -1,4 +1,4 @@
-"""Distillation: training of the scene on raw frames and repairs together, and the check of its result."""
+"""Distillation: training of the scene on frame images and repairs together, and the check of its result."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from cleargs.formation.movement import TOLERANCE
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import hide_masked
-from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, harm_of
+from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, compare_on_controls
 from cleargs.rivr.targets import Supervision
 from cleargs.scene.folder import SceneFolder
 from cleargs.scene.training import train_into
-from cleargs.scene.viewer import SceneViewer, observation
+from cleargs.scene.viewer import SceneViewer, observed_image
 from cleargs.splat.backend import psnr
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.views import TrainingView
@@ -40,12 +40,12 @@ def distil(
     repaired: float = 1.0,  # share of the frames that have a repair
     reporter: Reporter,
 ) -> SceneViewer:
-    """Continue the training on raw and repaired views, with Adam's moments; return the scene after it.
+    """Continue the training on frame images and repairs, with Adam's moments; return the scene after it.
 
     A finished training is read back. An interrupted one resumes from its checkpoint, which is deleted at the
     end.
 
-    ``even`` draws each repair as often as each raw frame. Otherwise a share of ``pseudo_share`` times
+    ``even`` draws each repair as often as each frame image. Otherwise a share of ``pseudo_share`` times
     ``repaired`` of the steps draws a repair: a few repairs must not be drawn as often as all frames together.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -92,15 +92,15 @@ def fidelity(
     """Return the agreement of the scene with the control frames; None without any.
 
     Pixels that move do not count: those of the scene ``before``, to compare with, or else of this scene. For
-    PSNR, the render has the motion of the frame, since a sharp scene is not wrong because raw frames are
+    PSNR, the render has the motion of the frame, since a sharp scene is not wrong because frame images are
     blurred and skewed by the camera's motion.
     """
     values, scores = [], []
     for view in controls:
-        render, (observed, mask) = scene.render(view), observation(view)
-        mask = (before or scene).still(view, mask)
+        render, (observed, mask) = scene.render(view), observed_image(view)
+        mask = (before or scene).static_mask(view, mask)
         counted = None if mask is None else torch.from_numpy(mask)
-        values.append(psnr(scene.observed(view), torch.from_numpy(observed), counted))
+        values.append(psnr(scene.formed(view), torch.from_numpy(observed), counted))
         scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))
     return Fidelity(fmean(values), fmean(scores)) if controls else None
 
@@ -117,9 +117,9 @@ def check_harm(
 ) -> HarmCheck:
     """Compare ``trained`` with ``g0`` on the control frames.
 
-    Without ``repaired`` views the scene was trained on raw frames only, as G0 was. No repair can have done
+    Without ``repaired`` views the scene was trained on frame images only, as G0 was. No repair can have done
     harm then, so nothing is rendered or scored.
     """
     views = [supervision.views[frame_id] for frame_id in supervision.controls] if repaired else []
     before, after = fidelity(g0, views, scorer, threads), fidelity(trained, views, scorer, threads, g0)
-    return harm_of(supervision.controls, before, after, limits)
+    return compare_on_controls(supervision.controls, before, after, limits)

@@ -1,7 +1,7 @@
-"""Gates that a repair must pass before it supervises: it must agree with the raw frame or with the render.
+"""Gates that a repair must pass before it supervises: it must agree with the frame image or with the render.
 
 Blur moves light by a few pixels, but it changes neither the place of content nor its mean colour. Every block
-of a correct repair is therefore at its place in the raw frame O_t or in the render R_t, and has the colours
+of a correct repair is therefore at its place in the frame image O_t or in the render R_t, and has the colours
 of one of the two. The scorers cannot check this, because they see one image at a time.
 """
 
@@ -29,7 +29,7 @@ _AT_REST = 0.8  # see `_lengths`
 
 
 class GateConfig(FrozenModel):
-    """Limits of the disagreement of a repair with both raw frame and render (docs/experiments/rivr.md)."""
+    """Limits of the disagreement of a repair with both frame image and render (docs/experiments/rivr.md)."""
 
     max_share: float = Field(
         0.1, ge=0.0, le=1.0, description="share of the blocks that may disagree; 1: no repair is refused"

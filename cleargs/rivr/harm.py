@@ -35,7 +35,7 @@ class Fidelity(NamedTuple):
     """Agreement of a scene with the control frames: means over them."""
 
     psnr: float
-    """PSNR of a frame's render, with the frame's motion, against its raw observation, dB."""
+    """PSNR of a frame's render, with the frame's motion, against the frame image, dB."""
     score: float
     """Primary score of a render, 0-100, higher is better."""
 
@@ -54,7 +54,7 @@ class HarmCheck:
     """The figure that fell by more than its margin; None if the distilled scene is published."""
 
 
-def harm_of(
+def compare_on_controls(
     frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
 ) -> HarmCheck:
     """Compare a distilled scene with G0 on the control frames ``frames``; without any there is no harm.

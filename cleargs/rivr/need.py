@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Literal, TypeAlias
 
-from cleargs.formation.capture import median_misfit
+from cleargs.formation.capture import median_residual
 from cleargs.formation.frame import FrameFormation, described
 from cleargs.rivr.candidates import EXPLAINED, KEPT
 from cleargs.rivr.tables import Selection
@@ -20,8 +20,8 @@ from cleargs.rva.allocation import Role
 Targets: TypeAlias = Literal["auto", "all"]
 
 UNEXPLAINED = 2.0
-"""A frame is in need if its misfit (mean difference from its render) is above this times the median misfit.
-Its weight by the misfit is then below `rounds.TRUSTED`."""
+"""A frame is in need if its residual (mean difference from its render) is above this times the median.
+Its weight by the residual is then below `rounds.TRUSTED`."""
 MIN_SHARE, MIN_TRIED = 1 / 16, 2
 """Share of the frames, and number of frames, that are tried at least."""
 
@@ -37,22 +37,22 @@ def frames_to_repair(
     frames = supervision.candidates
     if which == "all":
         return [frame.frame_id for frame in frames]
-    median = median_misfit(formations.values(), {frame.frame_id: frame.weight for frame in frames})
+    median = median_residual(formations.values(), {frame.frame_id: frame.weight for frame in frames})
 
     def order(frame: FrameAssessment) -> tuple[bool, float, float, int]:
         """Return a sort key, neediest frame first. It begins with True where the frame is not in need."""
         formation = formations.get(frame.frame_id, FrameFormation(frame.frame_id))
-        misfit = formation.misfit / median if median > 0.0 else 0.0
+        residual = formation.residual / median if median > 0.0 else 0.0
         unmodelled = frame.role == Role.REACTIVATED and formation.model == "none"
-        in_need = frame.role == Role.SUPPRESSED or misfit > UNEXPLAINED or unmodelled
-        return not in_need, -misfit, frame.R - frame.B, frame.frame_id
+        in_need = frame.role == Role.SUPPRESSED or residual > UNEXPLAINED or unmodelled
+        return not in_need, -residual, frame.R - frame.B, frame.frame_id
 
     least = max(MIN_TRIED, math.ceil(MIN_SHARE * len(frames)))
     ranked = enumerate(sorted(map(order, frames)))
     return sorted(frame_id for k, (spared, *_, frame_id) in ranked if k < least or not spared)
 
 
-def rows_of_others(
+def untried_rows(
     targets: Collection[int], supervision: Supervision, formations: Mapping[int, FrameFormation]
 ) -> list[Selection]:
     """Return a row for every frame that no round repairs, with the reason to keep it as filmed."""

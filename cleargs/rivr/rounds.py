@@ -33,7 +33,7 @@ from cleargs.rivr.candidates import (
 from cleargs.rivr.config import RepairConfig
 from cleargs.rivr.gates import rejection_reason
 from cleargs.rivr.tables import Selection, chosen_counts
-from cleargs.scene.viewer import Deblurred, SceneViewer, observation
+from cleargs.scene.viewer import Deblurred, SceneViewer, observed_image
 from cleargs.splat.views import TrainingView
 from cleargs.types import ImageF32, MaskBool
 
@@ -53,7 +53,7 @@ class RepairContext:
     primary: Scorer
     tiebreak: Scorer
     cache: Path
-    """Folder for the restorations of raw frames, each of which is made when it is first needed."""
+    """Folder for the restorations of frame images, each of which is made when it is first needed."""
     threads: int
 
     def restored(
@@ -68,20 +68,20 @@ class RepairContext:
             return self._restored(render), "render", None
         deblurred = scene.deblur(view) if self.config.undo_motion else None
         if deblurred is None:
-            return self._restored_observation(view), "observation", None
+            return self._restored_observed(view), "observed", None
         return self._restored(deblurred.image), "deblurred", deblurred
 
     def _restored(self, image: ImageF32) -> ImageF32:
         return self.expert.restore(image, threads=self.threads)
 
-    def _restored_observation(self, view: TrainingView) -> ImageF32:
-        """Return D_t of a raw frame from the cache: all rounds and resumed runs have the same bits."""
+    def _restored_observed(self, view: TrainingView) -> ImageF32:
+        """Return D_t of a frame image from the cache: all rounds and resumed runs have the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
             return from_layer(read_exr(path).layers["restored"])
         except StoreError:  # missing or incomplete
             self.cache.mkdir(exist_ok=True)
-            restored = to_layer(self._restored(observation(view)[0]))
+            restored = to_layer(self._restored(observed_image(view)[0]))
             write_exr(path, LayeredImage({"restored": restored}, {}))
             return from_layer(read_exr(path).layers["restored"])
 
@@ -129,8 +129,8 @@ def repair(
     rendered = scene.render(view)
     restored, source, deblurred = context.restored(view, rendered, scene)
     explained = scene.explained(view)
-    observed, mask = observation(view)
-    mask = scene.still(view, mask)  # regions that move are not repaired
+    observed, mask = observed_image(view)
+    mask = scene.static_mask(view, mask)  # regions that move are not repaired
     layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
     config, threads = context.config, context.threads
     stored = (from_layer(layers["render"]), from_layer(layers["restored"]))
@@ -173,7 +173,7 @@ def repair(
     return row, LayeredImage(layers, {ROW: json.dumps(asdict(row))})
 
 
-def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
+def forget_other_frames(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
     """Remove files that do not belong to the EXRs of ``targets`` in rounds 1 to ``rounds``."""
     ours = {
         f"round_{number:02d}/{view.frame_id:06d}.exr" for number in range(1, rounds + 1) for view in targets
@@ -196,7 +196,7 @@ def read_row(out: Path, exr: str) -> Selection | None:
 def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView:
     """Return the chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
-    @cache  # a training loads a view often; the mask comes with the raw frame, which is then decoded once
+    @cache  # a training loads a view often; the mask comes with the frame image, which is then decoded once
     def mask() -> MaskBool | None:
         return target.load()[1]
 

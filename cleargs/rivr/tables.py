@@ -18,7 +18,7 @@ from cleargs.parquet import read_table, schema_of, write_table
 from cleargs.rivr.candidates import CANDIDATES, OBSERVED, REFUSED, Scores, Source
 
 _NAME = "name of the scorer that decides"
-_SCORES = "candidate, or observed (the raw frame, if it may be kept) -> score, 0-100, by the scorer"
+_SCORES = "candidate, or observed (the frame image, if it may be kept) -> score, 0-100, by the scorer"
 SCORES = pa.map_(pa.string(), pa.float32())
 
 
@@ -40,11 +40,11 @@ class Selection:
     ]
     tiebreak: Annotated[Scores, SCORES, f"{_SCORES} that decides near-ties"]
     restored_from: Annotated[
-        Source | None, "image that the expert restored to D_t: observation, deblurred or render"
+        Source | None, "image that the expert restored to D_t: observed, deblurred or render"
     ]
     blur_px: Annotated[float | None, pa.float32(), "mean way of the pixels while exposed, as undone"]
     skew_px: Annotated[float | None, pa.float32(), "their mean way from the first to the last row"]
-    chosen: Annotated[str, "a candidate; observed: the raw frame needs no repair"]
+    chosen: Annotated[str, "a candidate; observed: the frame image needs no repair"]
     accepted: Annotated[bool, "true if the chosen candidate became a pseudo observation"]
     reason: Annotated[str, "reason of the choice, or of the lack of a pseudo observation"]
 
@@ -91,7 +91,7 @@ def read_selection(path: Path) -> list[Selection]:
 
 
 def latest_accepted(rows: Sequence[Selection]) -> list[Selection]:
-    """Return the latest accepted row of every frame that is not kept raw, by frame_id."""
+    """Return the latest accepted row of every frame with a repair, by frame_id."""
     kept = kept_raw(rows)
     latest = {row.frame_id: row for row in sorted(rows, key=lambda row: row.round) if row.accepted}
     return [latest[frame_id] for frame_id in sorted(latest.keys() - kept)]
@@ -107,7 +107,7 @@ def kept_raw(rows: Sequence[Selection]) -> set[int]:
 
 
 def repaired_share(rows: Sequence[Selection]) -> float:
-    """Return the share of repaired frames among those that are repaired or kept raw; 0 without either."""
+    """Return the share of repaired frames among those that are repaired or kept; 0 without either."""
     repaired, kept = len(latest_accepted(rows)), len(kept_raw(rows))
     return repaired / max(repaired + kept, 1)
 

@@ -27,7 +27,7 @@ class FrameAssessment:
     role: str
     reliable: bool
     """True if the frame is in RVA's reliable set A: R >= tau_R and B <= tau_B, with any role."""
-    stand_in: bool
+    fallback: bool
     """True if no frame is reliable and this one is among the best by R - B."""
     weight: float = 1.0
     """Weight of the frame's raw supervision; a frame of weight 0 is never loaded."""
@@ -36,13 +36,13 @@ class FrameAssessment:
 def select_controls(frames: Sequence[FrameAssessment], share: float = 0.125) -> list[int]:
     """Select the control frames, which get no repair and measure harm by the repairs of others, in order.
 
-    They are a ``share`` (at least one; none for 0) of the reliable frames, or of the stand-ins if there are
+    They are a ``share`` (at least one; none for 0) of the reliable frames, or of the fallbacks if there are
     none. These are divided, in order, into that many nearly equal parts. The best frame of each part by R - B
     is selected, or among equals the nearest to the middle of the part. Soft frames are not selected, since
     they would count every gain in sharpness as a loss.
     """
     reliable = [frame for frame in frames if frame.reliable]
-    references = reliable or [frame for frame in frames if frame.stand_in]
+    references = reliable or [frame for frame in frames if frame.fallback]
     if not references or share == 0.0:
         return []
     count = max(1, int(len(references) * share))
@@ -94,7 +94,7 @@ class Supervision:
 
     @property
     def real(self) -> list[TrainingView]:
-        """The active raw frames D_real, including the control frames, as for G0."""
+        """The active frame images D_real, including the control frames, as for G0."""
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property

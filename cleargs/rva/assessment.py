@@ -48,7 +48,7 @@ class Assessment:
     R: ArrayF64
     B: ArrayF64
     reliable: ArrayBool
-    stand_in: ArrayBool
+    fallback: ArrayBool
     C: ArrayF64
     D: ArrayF64
     O: ArrayF64
@@ -84,9 +84,9 @@ def assess(
 
     reliable = allocation.is_reliable(r, b, config)
     # Without a reliable frame, the best by R - B replace them in the geometry.
-    stand_ins = 0 if reliable.any() else max(1, round(config.stand_in_share * len(r)))
-    stand_in = allocation.best_frames(r, b, stand_ins)
-    reference = reliable | stand_in
+    fallbacks = 0 if reliable.any() else max(1, round(config.fallback_share * len(r)))
+    fallback = allocation.best_frames(r, b, fallbacks)
+    reference = reliable | fallback
     rotations = poses.rotations[rows]
     centres = np.asarray(-np.einsum("nij,ni->nj", rotations, poses.translations[rows]))  # -R^T t
     directions = rotations[:, 2, :]  # OpenCV axes, z forward
@@ -124,7 +124,7 @@ def assess(
         R=R,
         B=B,
         reliable=scatter(reliable, False),
-        stand_in=scatter(stand_in, False),
+        fallback=scatter(fallback, False),
         C=scatter(C, nan),
         D=scatter(D, nan),
         O=scatter(overlap, nan),
@@ -207,7 +207,7 @@ def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
         "reactivated_for": {rule.value: rules[rule.value] for rule in Rule},
         "active": int(np.count_nonzero(result.weight)),
         "reliable": int(np.count_nonzero(result.reliable)),
-        "stand_in": int(np.count_nonzero(result.stand_in)),
+        "fallback": int(np.count_nonzero(result.fallback)),
         "weights": {f"{edge:.1f}": int(n) for edge, n in zip(edges, histogram, strict=False)},
         "effective_frames": round(allocation.effective_sample_size(result.weight), 3),
         "bins": len(result.covered),

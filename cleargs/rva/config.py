@@ -104,7 +104,7 @@ class AssessmentConfig(FrozenModel):
     eta: Unit = Field(0.30, description="weight of the visibility redundancy O, subtracted from G")
 
     # Scores from cues, and the reliable set.
-    stand_in_share: ClassVar[float] = 0.10
+    fallback_share: ClassVar[float] = 0.10
     """If no frame is reliable, this share of the registered frames (at least one; best by R - B) replaces the
     reliable set in the geometry."""
     w_R: tuple[Unit, Unit, Unit, Unit, Unit] = Field(

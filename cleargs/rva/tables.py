@@ -48,7 +48,7 @@ FRAMES = pa.schema(
         column("role", pa.string(), "strong, geometric, auxiliary, reactivated or suppressed"),
         _score("weight", "weight of the frame's raw supervision; 0: the frame is not used"),
         column(
-            "stand_in",
+            "fallback",
             pa.bool_(),
             "no frame is reliable, and this one is among the best by R - B that replace the set A in C, D "
             "and O (roles do not change)",

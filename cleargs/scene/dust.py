@@ -18,7 +18,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.trainer import Trained
+from cleargs.splat.training import Trained
 from cleargs.splat.views import TrainingView
 from cleargs.types import MaskBool
 
@@ -46,7 +46,7 @@ def without_dust(
     moving: Mapping[int, MaskBool],
     device: str,
 ) -> Dusted:
-    """Remove the `DUST` of a training, and its moments of Adam, if the raw frames lose at most `MAX_LOSS`."""
+    """Remove the `DUST` of a training, and its moments of Adam, if the frames lose at most `MAX_LOSS`."""
     real = [view for view in views if view.kind == "real"]
     few, scene = spread(real, MAX_EVALUATED), trained.scene.to(device)
     largest = contributions(scene, (view.camera for view in real), lambda: None)

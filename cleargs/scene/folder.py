@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from cleargs.formation.frame import FrameFormation
     from cleargs.splat.gaussians import Gaussians
     from cleargs.splat.scene import Scene
-    from cleargs.splat.trainer import Trained
+    from cleargs.splat.training import Trained
     from cleargs.splat.types import Moments
     from cleargs.types import MaskBool
 

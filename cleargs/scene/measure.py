@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 
 from cleargs.formation.exposure import Exposure
+from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.movement import counted
-from cleargs.formation.observed import render_observed
 from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.scene import Scene
@@ -19,7 +19,7 @@ from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 from cleargs.types import MaskBool
 
 MAX_EVALUATED = 32
-"""Maximum number of frames, evenly spread, on which a stage compares its scene with the photographs."""
+"""Maximum number of frames, evenly spread, on which a stage compares its scene with the frame images."""
 
 
 class ViewPsnr(NamedTuple):
@@ -49,7 +49,7 @@ def evaluate_views(
     moving: Mapping[int, MaskBool] | None = None,
     engine: Rasteriser | None = None,
 ) -> list[ViewPsnr]:
-    """Compare the observed image of the scene with every view, in their order, at full size.
+    """Compare the formed image of the scene with every view, in their order, at full size.
 
     Pixels of the cells ``moving``, by frame_id, do not count (see `cleargs.formation.movement`).
     """
@@ -58,11 +58,11 @@ def evaluate_views(
     formations = formations or {}
     fits = []
     for view in views:
-        target, mask = images.get(view)
-        mask = counted(mask, (moving or {}).get(view.frame_id), target)
-        image = render_observed(scene, view, exposure, formations.get(view.frame_id), engine=engine)
-        unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
+        observed, mask = images.get(view)
+        mask = counted(mask, (moving or {}).get(view.frame_id), observed)
+        image = render_formed(scene, view, exposure, formations.get(view.frame_id), engine=engine)
+        unseen = torch.from_numpy(unseen_pixels(view.frame_id, *observed.shape[:2])).to(observed.device)
         unseen = unseen if mask is None else unseen & mask
-        psnr_unseen = psnr(image, target, unseen) if bool(unseen.any()) else None
-        fits.append(ViewPsnr(psnr(image, target, mask), psnr_unseen))
+        psnr_unseen = psnr(image, observed, unseen) if bool(unseen.any()) else None
+        fits.append(ViewPsnr(psnr(image, observed, mask), psnr_unseen))
     return fits

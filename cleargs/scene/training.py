@@ -14,6 +14,7 @@ from cleargs.scene.folder import SceneFolder
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.scene import Scene
 from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import run
 from cleargs.splat.views import TrainingView
 from cleargs.timing import timed
 
@@ -35,7 +36,7 @@ def train_into(
 ) -> Dusted:
     """Train a scene, remove its dust and write the files of `SceneFolder` into ``folder``."""
     trainer = Trainer(scene, views, config, formation=formation, device=device, **options)
-    trained = trainer.run(checkpoint=checkpoint, reporter=reporter, label=label, round=round)
+    trained = run(trainer, checkpoint=checkpoint, reporter=reporter, label=label, round=round)
     learned = formation.exposure or exposure
     with timed("removing dust"):
         dusted = without_dust(trained, views, learned, formation.frames, formation.moving, device)

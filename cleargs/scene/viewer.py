@@ -13,11 +13,11 @@ from torch import Tensor
 
 from cleargs.capture.folders import spread
 from cleargs.formation.deblur import deblur
+from cleargs.formation.estimate import Shot, Terms, fit_motion
+from cleargs.formation.formed import FormedView, render_formed
 from cleargs.formation.frame import FrameFormation
-from cleargs.formation.look import Shot, Terms, fit_motion
 from cleargs.formation.measured import MeasuredPath
-from cleargs.formation.movement import still_pixels
-from cleargs.formation.observed import FormedView, render_observed
+from cleargs.formation.movement import static_pixels
 from cleargs.formation.shutter import rolls
 from cleargs.media.image import to_float32
 from cleargs.scene.folder import SceneFolder
@@ -32,7 +32,7 @@ from cleargs.types import ImageF32, MaskBool
 
 @dataclass(frozen=True, eq=False)
 class Deblurred:
-    """A raw frame without its motion or defocus."""
+    """A frame image without its motion or defocus."""
 
     image: ImageF32
     """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
@@ -42,17 +42,17 @@ class Deblurred:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """The training's explanation of a raw frame: the render after image formation."""
+    """The training's explanation of a frame: the render after image formation."""
 
     image: ImageF32
     """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
     formation: FrameFormation
     weight: float
-    """The frame's weight at the end of the training: RVA's, or a higher one by its misfit."""
+    """The frame's weight at the end of the training: RVA's, or a higher one by its residual."""
 
 
-def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
-    """Return the raw frame O_t [H, W, 3], float32 sRGB in [0, 1], and its mask [H, W] (None: all count)."""
+def observed_image(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
+    """Return the frame image O_t [H, W, 3], float32 sRGB in [0, 1], and its mask [H, W] (None: all count)."""
     pixels, mask = view.load()
     return to_float32(pixels), mask
 
@@ -76,13 +76,13 @@ class SceneViewer:
 
     def render(self, view: TrainingView) -> ImageF32:
         """Return R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
-        image: ImageF32 = render_observed(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
+        image: ImageF32 = render_formed(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
-    def observed(self, view: TrainingView) -> Tensor:
-        """Return the scene as the camera of a raw frame saw it, [H, W, 3] sRGB in [0, 1]."""
+    def formed(self, view: TrainingView) -> Tensor:
+        """Return the scene as the camera of a frame saw it, [H, W, 3] sRGB in [0, 1]."""
         formation = self.formations.get(view.frame_id)
-        return render_observed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
+        return render_formed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
     def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
         """Return the PSNR, dB, of the pixels that no training saw; None if there are none.
@@ -95,30 +95,30 @@ class SceneViewer:
         )
         return pooled_unseen(fits)
 
-    def still(self, view: TrainingView, mask: MaskBool | None) -> MaskBool | None:
+    def static_mask(self, view: TrainingView, mask: MaskBool | None) -> MaskBool | None:
         """Return ``mask`` without the pixels in which something moves; None: all pixels count."""
         if view.frame_id not in self.moving:
             return mask
-        pixels = still_pixels(self.moving[view.frame_id], view.camera.height, view.camera.width)
+        pixels = static_pixels(self.moving[view.frame_id], view.camera.height, view.camera.width)
         return pixels if mask is None else pixels & mask
 
     def explained(self, view: TrainingView) -> Explained | None:
-        """Return the training's explanation of a raw frame; None without a model of the frame."""
+        """Return the training's explanation of a frame; None without a model of the frame."""
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return None
-        return Explained(self.observed(view).numpy(), formation, self._weights[view.frame_id])
+        return Explained(self.formed(view).numpy(), formation, self._weights[view.frame_id])
 
     def deblur(self, view: TrainingView) -> Deblurred | None:
-        """Return the raw frame without its motion or defocus; None if no model explains the frame.
+        """Return the frame image without its motion or defocus; None if no model explains the frame.
 
         If the training has estimated the formation of the frame, that is used. Otherwise it is estimated
         here.
         """
-        observed, mask = observation(view)
+        observed, mask = observed_image(view)
         affine = self._affine(view)
         found = self.formations.get(view.frame_id, FrameFormation(view.frame_id))
-        if found.draws == 0:
+        if found.steps == 0:
             found = fit_motion(
                 found,
                 FormationConfig(),
@@ -130,14 +130,14 @@ class SceneViewer:
                     self._with_depth,
                 ),
                 Terms(
-                    doubted=True,
-                    shutter="rolls" if rolls(self.formations.values()) else "still",
+                    low_weight=True,
+                    shutter="rolling" if rolls(self.formations.values()) else "global",
                     measured=self.motions.get(view.frame_id),
                 ),
             )
         if found.model == "none":
             return None
-        formed = FormedView(view.camera, 1.0, affine=affine, formation=found, still=True)
+        formed = FormedView(view.camera, 1.0, affine=affine, formation=found, global_shutter=True)
         return Deblurred(_deblurred(formed, self._with_depth(formed.camera), observed, mask), found)
 
     def formed_layers(self, view: TrainingView, factor: float = 1.0) -> dict[str, ImageF32]:
@@ -149,7 +149,7 @@ class SceneViewer:
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return {}
-        observed, mask = observation(view)
+        observed, mask = observed_image(view)
         camera = view.camera.scaled(factor)
         if factor < 1.0:
             size = camera.width, camera.height
@@ -158,9 +158,14 @@ class SceneViewer:
                 mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         seen, formed = (
             FormedView(
-                camera, 1.0, affine=self._affine(view), formation=formation, factor=factor, still=still
+                camera,
+                1.0,
+                affine=self._affine(view),
+                formation=formation,
+                factor=factor,
+                global_shutter=stopped,
             )
-            for still in (False, True)
+            for stopped in (False, True)
         )
         render = self._with_depth(seen.camera)
         explained = seen.forward(render).clamp(0.0, 1.0).cpu().numpy()

@@ -47,11 +47,11 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
 
 
 class FormationConfig(FrozenModel):
-    """Settings of image formation, which is estimated per raw frame during the training."""
+    """Settings of image formation, which is estimated per frame during the training."""
 
     enabled: bool = Field(
         True,
-        description="compare each raw frame with the render after image formation: motion blur, rolling "
+        description="compare each frame image with the render after image formation: motion blur, rolling "
         "shutter, defocus",
     )
     start: float = Field(
@@ -82,9 +82,9 @@ class FormationConfig(FrozenModel):
         return ("on" if value else "off") if isinstance(value, bool) else value
 
     accept: ClassVar[float] = 0.02
-    """Share of the misfit (mean difference) that a model must explain (docs/experiments/formation.md)."""
+    """Share of the residual (mean difference) that a model must explain (docs/experiments/formation.md)."""
     trust: ClassVar[float] = 1.0
-    """Exponent p in the weight of an explained frame, max(w_RVA, min(1, median misfit / misfit)^p)."""
+    """Exponent p in the weight of an explained frame, max(w_RVA, min(1, median residual / residual)^p)."""
 
 
 class TrainConfig(FrozenModel):
@@ -191,7 +191,7 @@ class TrainConfig(FrozenModel):
         "degrees from the first step",
     )
 
-    formation: FormationConfig = Field(FormationConfig(), description="image formation of each raw frame")
+    formation: FormationConfig = Field(FormationConfig(), description="image formation of each frame")
 
     checkpoint_interval: int = Field(
         200,

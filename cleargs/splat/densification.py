@@ -32,7 +32,7 @@ Arrays = dict[str, Any]
 """Arrays or tensors by name, float32, first axis N."""
 
 
-class Draws(Protocol):
+class RandomSource(Protocol):
     """Source of random numbers, such as `numpy.random.Generator`."""
 
     def standard_exponential(self, size: int, /) -> Any: ...
@@ -83,7 +83,7 @@ def refine(
     rate: float,  # maximum growth, as a fraction of N
     budget: int,  # maximum number of Gaussians after the growth
     min_opacity: float,  # opacity up to which a Gaussian is dead
-    rng: Draws,
+    rng: RandomSource,
     xp: Any = np,  # module of the arrays, numpy or torch
 ) -> tuple[Arrays, list[Arrays]]:
     """Split live Gaussians, drawn in proportion to their errors, in `ROUNDS` rounds.
@@ -129,7 +129,9 @@ def _write_rows(array: Any, places: Any, rows: Any, xp: Any) -> Any:
     return array
 
 
-def sample_once(weights: Any, count: int, rng: Draws, xp: Any = np) -> Any:  # [N] float64 -> [count] int64
+def sample_once(
+    weights: Any, count: int, rng: RandomSource, xp: Any = np
+) -> Any:  # [N] float64 -> [count] int64
     """Draw indices without replacement, in proportion to ``weights`` [N] >= 0.
 
     At least ``count`` weights must be positive. Source: Efraimidis and Spirakis, "Weighted random sampling

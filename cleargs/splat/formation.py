@@ -32,10 +32,10 @@ class Formed(Protocol):
     """Pixels [H, W] that count; None: all. After `forward`, those in which something moves are left out."""
 
     def forward(self, render: Render) -> Tensor:
-        """Return the observed image [H, W, 3] sRGB of a render."""
+        """Return the formed image [H, W, 3] sRGB of a render."""
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Return the gradient of the render's image, given that of the observed image [H, W, 3]."""
+        """Return the gradient of the render's image, given that of the formed image [H, W, 3]."""
 
     def learn(self) -> None:
         """Update the learned parameters, by the gradient of the last `backward`."""
@@ -49,7 +49,7 @@ class Formation(Protocol):
         view: TrainingView,
         factor: float,  # scale of the training image in this step
         progress: float,  # position in the schedule, 0 to 1
-        target: Tensor,  # [H, W, 3] sRGB at this scale
+        observed: Tensor,  # [H, W, 3] sRGB at this scale
         mask: Tensor | None,  # [H, W] pixels that count
         render: Renderer,  # renders the current scene
     ) -> Formed | None:
@@ -69,14 +69,14 @@ class Formation(Protocol):
 
 
 SATURATED = 253 / 255
-"""Value (sRGB) from which a photograph is saturated: the light was as bright as this or brighter."""
+"""Value (sRGB) from which a frame image is saturated: the light was as bright as this or brighter."""
 
 
-def recorded(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a render as the sensor of a photograph records it, and a mask of the values that change.
+def clip_to_saturation(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a render as the sensor of a frame image records it, and a mask of the values that change.
 
-    Both images are [H, W, 3] sRGB. If the photograph is saturated and the render is brighter, the value of
-    the photograph replaces that of the render. So one overexposed frame does not darken a lamp.
+    Both images are [H, W, 3] sRGB. If the frame image is saturated and the render is brighter, the value of
+    the frame image replaces that of the render. So one overexposed frame does not darken a lamp.
     """
     too_bright = (target >= SATURATED) & (image > target)
     return torch.where(too_bright, target, image), too_bright

@@ -38,7 +38,7 @@ def rate_factor(steps: int) -> float:
 def random_grey(seed: Sequence[int], step: int) -> Colour:
     """Return the colour behind the scene in a step, if the settings name none.
 
-    Only an opaque pixel can match the photograph over every grey, so filmed surfaces become opaque.
+    Only an opaque pixel can match the frame image over every grey, so filmed surfaces become opaque.
     Over black alone, dark parts of the scene stay transparent. Random colours instead of greys make the
     gradients noisier and the scenes a little softer (docs/experiments/training.md).
     """

@@ -1,4 +1,4 @@
-"""The training loop of G0, RIVR and the consolidation: optimise a scene on weighted views.
+"""The training of G0, RIVR and the consolidation: optimise a scene on weighted views.
 
 A step does not use autograd: render -> loss and its gradient -> backward pass -> Adam -> densification.
 Random numbers depend only on (seed, stream, step), so a resumed training has the same result.
@@ -9,11 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -21,55 +19,32 @@ import torch
 from torch import Tensor
 
 from cleargs.errors import InputError, StageError
-from cleargs.media.image import write_rgb
-from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
-from cleargs.splat import compilation
 from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
 from cleargs.splat.budget import resolve_config, seconds_by_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.densification import relative_error
 from cleargs.splat.densifier import Densifier, DensifierState, load_densifier
-from cleargs.splat.formation import Formation, Formed, recorded
+from cleargs.splat.formation import Formation, Formed, clip_to_saturation
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.interruption import deferred_sigterm
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.rasteriser import view_numbers
 from cleargs.splat.scene import Colour, Scene
 from cleargs.splat.schedule import Schedule, random_grey
-from cleargs.splat.state import load_state, save_state
 from cleargs.splat.texture import TextureLoss, crop_of
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, TrainingView, require_views
 from cleargs.timing import timed
 
-_NOTE_INTERVAL = 10  # steps between updates of the progress bar, and on a GPU between updates of the log
+NOTE_INTERVAL = 10  # steps between updates of the progress bar, and on a GPU between updates of the log
 
 _PREVIEW_SIDE = 640  # maximum of the longer side of a preview, px
 
-_CHECK_INTERVAL = 10
-"""Steps between checks for NaN and infinity (a check takes less than 1 ms for 50,000 Gaussians)."""
-
-_SHORT_SAVE, _SAVE_SHARE = 0.1, 0.05
-"""Checkpoints of up to `_SHORT_SAVE` s are saved whenever they are due. Longer ones take up to this share of
-the time. On an H200, 200 steps with up to 400,000 Gaussians take about 3 s, and their checkpoint 0.4 s."""
-
-
-@dataclass(frozen=True)
-class Trained:
-    """Result of a training."""
-
-    scene: Scene
-    rows: pa.Table
-    """Log with one row per step, schema `cleargs.splat.tables.TRAIN`."""
-    state: dict[str, Tensor]
-    """Content of ``state.safetensors``, from which the next training continues: all but the parameters."""
-
 
 class Trainer:
-    """A training of a scene on weighted views. `run` performs all steps.
+    """A training of a scene on weighted views. `cleargs.splat.training.run` performs all steps.
 
     Raises:
         InputError: All weights are 0, or the scene is not finite.
@@ -96,6 +71,7 @@ class Trainer:
         self._pseudo_weight = pseudo_weight
         self._config = config = resolve_config(config, self._real or self._pseudo)
         self.length = config.length
+        self.checkpoint_interval = config.checkpoint_interval
         self._seed = tuple(seed)
         self._scene = scene
         self._device = torch.device(device)
@@ -122,57 +98,6 @@ class Trainer:
         self._fingerprint = _fingerprint(scene, weighted, config, others)
         self.done = 0
 
-    def run(
-        self, *, checkpoint: Path, reporter: Reporter, label: str = "training", round: int = 0
-    ) -> Trained:
-        """Train to the end, and return the result. ``label`` is the name of the training in messages.
-
-        If the file ``checkpoint`` belongs to this training, the training resumes from it; the result is the
-        same bit for bit. A preview is written next to it. After a SIGTERM, if the program has a handler for
-        it, the training saves a checkpoint and stops. ``round`` is a column of the log.
-
-        Raises:
-            StageError: A parameter or the loss is not finite.
-            KeyboardInterrupt: The process received SIGTERM.
-        """
-        saved = load_state(checkpoint, reporter)
-        if saved is not None and not self.matches(saved):
-            reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
-        elif saved is not None:
-            self.restore(saved)
-            reporter.info(f"{label}: resuming from step {self.done} of {self.length}")
-        compilation.finish(self._device.type, self._backend.warm_up, reporter)
-        with (
-            support.memory_errors(),
-            deferred_sigterm() as terminated,
-            reporter.task(label, total=self.length) as task,
-        ):
-            fractions, rate = self.work_fractions(), Rate()
-            next_save = 0.0
-            while self.done < self.length:
-                self.step()
-                stopped, now = terminated(), time.monotonic()
-                due = stopped or (
-                    self.done % self._config.checkpoint_interval == 0
-                    and self.done < self.length
-                    and now >= next_save
-                )
-                if self.done % _NOTE_INTERVAL == 0:
-                    self._show(task, fractions, rate)
-                if due or self.done % _CHECK_INTERVAL == 0:
-                    self.check_finite()
-                if due:
-                    with timed("checkpoint and preview"):
-                        save_state(checkpoint, self.state())
-                        write_rgb(checkpoint.with_name(PREVIEW), self.preview().cpu().numpy())
-                    next_save = _next_save(now, time.monotonic())
-                if stopped:
-                    raise KeyboardInterrupt
-            self.check_finite()
-            self._show(task, fractions, rate)
-        state = {k: tensor.cpu() for k, tensor in self.state().items() if not k.startswith("parameter.")}
-        return Trained(self.scene.to("cpu"), self.rows(round), state)
-
     @property
     def scene(self) -> Scene:
         """Current scene; it shares memory with the trainer."""
@@ -197,17 +122,20 @@ class Trainer:
             target, mask = self._cache.get(view, factor)
         alpha = self._cache.alpha
         colour = random_grey(self._seed, schedule_step) if config.background is None else None
-        formed, looks = None, _Looks(partial(self._render, depth=True), colour, self._scene.background)
+        formed, renders = (
+            None,
+            _StepRenders(partial(self._render, depth=True), colour, self._scene.background),
+        )
         if self._formation is not None:
             progress = schedule_step / config.planned
             opaque = mask if alpha is None else _both(mask, alpha > 0.5)
             with timed("search for the formation"):
-                formed = self._formation.form(view, factor, progress, target, opaque, looks.render)
+                formed = self._formation.form(view, factor, progress, target, opaque, renders.render)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
         depth = formed is not None and formed.needs_depth
-        render = looks.last_of(camera) or self._render(camera, depth=depth, background=colour)
+        render = renders.last_of(camera) or self._render(camera, depth=depth, background=colour)
         with timed("image formation"):
             image = render.image if formed is None else formed.forward(render)
         if alpha is None:
@@ -216,7 +144,7 @@ class Trainer:
             affine = None if formed is None else formed.affine
             target = _over(target, alpha, colour or self._scene.background, affine)
             mask = mask if formed is None else _with_empty(formed.mask, mask, alpha)
-        image, too_bright = recorded(image, target)
+        image, too_bright = clip_to_saturation(image, target)
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         with timed("loss"):
             gradient = self._add_loss(image, target, mask, weight)
@@ -265,16 +193,6 @@ class Trainer:
         megapixels = sum(view.camera.width * view.camera.height for view in views) / len(views) / 1e6
         seconds = seconds_by_step(self._config, len(views), megapixels, self._scene.gaussians.num)
         return [0.0, *(np.cumsum(seconds) / seconds.sum()).tolist()]
-
-    def _show(self, task: Task, fractions: Sequence[float], rate: Rate) -> None:
-        """Show iterations per second, PSNR and number of Gaussians in the progress bar.
-
-        The rate starts with the first call, because earlier steps may include the compilation of kernels.
-        """
-        words = [f"training PSNR {self.last_psnr:.2f} dB", f"{self._gaussians.num} Gaussians"]
-        if (steps := rate.per_second(self.done)) is not None:
-            words.insert(0, f"{steps:.1f} it/s")
-        task.update(done=self.done, note=", ".join(words), share=fractions[self.done])
 
     def check_finite(self) -> None:
         """Raise StageError with the step and the parameter if a value is NaN or infinite."""
@@ -347,7 +265,7 @@ class Trainer:
             self._image_gradients[size] = torch.empty_like(target)
         gradient = self._image_gradients[size]
         self._losses.add(self.done, image, target, mask, weight=weight, gradient=gradient)
-        if not support.on_gpu(self._device) or len(self._losses) >= _NOTE_INTERVAL:
+        if not support.on_gpu(self._device) or len(self._losses) >= NOTE_INTERVAL:
             self._read_losses()
         return gradient
 
@@ -392,7 +310,7 @@ class Trainer:
         )
 
 
-class _Looks:
+class _StepRenders:
     """Renders for image formation within one step. The step reuses the last one if the camera is the same."""
 
     def __init__(self, render: Callable[..., Render], colour: Colour | None, background: Colour) -> None:
@@ -438,12 +356,6 @@ def _over(cut_out: Tensor, alpha: Tensor, behind: Colour, affine: Tensor | None)
 def _numbers(camera: Camera) -> list[float]:
     rolling = [] if camera.readout is None else camera.readout.numbers()
     return [camera.width, camera.height, *view_numbers(camera), *rolling]
-
-
-def _next_save(begun: float, ended: float) -> float:
-    """Return the time of the earliest next checkpoint after one that took from ``begun`` to ``ended``, s."""
-    seconds = ended - begun
-    return ended if seconds <= _SHORT_SAVE else ended + seconds * (1.0 / _SAVE_SHARE - 1.0)
 
 
 def _fingerprint(

@@ -29,9 +29,9 @@ class TrainingView:
     frame_id: int
     camera: Camera
     weight: float
-    """Factor on the loss: the RVA weight w_i of a raw frame."""
+    """Factor on the loss: the RVA weight w_i of a frame image."""
     kind: Literal["real", "pseudo"]
-    """A raw frame (real), or its repair (pseudo)."""
+    """A frame image (real), or its repair (pseudo)."""
     load: Callable[[], tuple[AnyImage, MaskBool | None]]
     """Function that loads the image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and the mask [H, W] (True:
     the pixel counts) or None. It is called on each cache miss."""

@@ -37,7 +37,7 @@ METERING_SHARE = 0.8
 
 
 @dataclass(frozen=True)
-class Look:
+class Tone:
     """Look of a camera: an S-shaped tone curve, then an unsharp mask on luma. Both use sRGB values."""
 
     contrast: float = 0.0
@@ -65,7 +65,7 @@ class Look:
         return np.asarray(np.clip(image + self.sharpening * detail[..., None], 0, 1), np.float64)
 
 
-PLAIN = Look()
+PLAIN = Tone()
 
 
 def develop(
@@ -74,7 +74,7 @@ def develop(
     stops: float = 0.0,  # exposure error
     noise: float = 0.0,  # standard deviation at mid grey after the exposure error, sRGB units
     rng: np.random.Generator | None = None,  # None: no noise
-    look: Look = PLAIN,
+    tone: Tone = PLAIN,
 ) -> ImageU8:  # [H, W, 3]
     """Convert linear light to an 8-bit sRGB image, with exposure error, sensor noise, clipping and look.
 
@@ -85,13 +85,13 @@ def develop(
         mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: converts ``noise`` to linear light
         shape = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
         image = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shape
-    return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
+    return np.asarray(np.rint(tone.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
 
 
-def phone_look(seed: int) -> Look:
+def tone_of(seed: int) -> Tone:
     """Return the look of a phone: up to a third more contrast in the middle tones, visible sharpening."""
     rng = np.random.default_rng([seed, Stream.PHONE_LOOK])
-    return Look(rng.uniform(3.0, 4.5), rng.uniform(0.4, 0.5), rng.uniform(0.4, 0.7))
+    return Tone(rng.uniform(3.0, 4.5), rng.uniform(0.4, 0.5), rng.uniform(0.4, 0.7))
 
 
 def metered_luminance(light: ArrayF64) -> float:  # [H, W, 3] linear

@@ -56,7 +56,7 @@ FRAMES = pa.schema(
         ),
         column("readout_s", pa.float64(), "time from first to last row, seconds; 0: global shutter"),
         column("shutter_share", pa.float64(), "exposure_s divided by the time between frames"),
-        column("tone_contrast", pa.float64(), "contrast of the tone curve, as in phone.Look; 0: none"),
+        column("tone_contrast", pa.float64(), "contrast of the tone curve, as in phone.Tone; 0: none"),
         column("tone_pivot", pa.float64(), "pivot of the tone curve, sRGB in [0, 1]"),
         column("sharpening", pa.float64(), "factor of the fine detail that is added; 0: none"),
         column("codec_bits_per_pixel", pa.float64(), "target rate of the H.264 coding; 0: not coded"),
@@ -131,11 +131,11 @@ def make_capture(
         require_even(width, height)
     rate = 1 / SHOT_SECONDS if rules.shots else FPS
     setup = setup or room_setup(frames, width, height, seed, rules.moving)
-    look = phone.phone_look(seed) if rules.phone else phone.PLAIN
+    tone = phone.tone_of(seed) if rules.phone else phone.PLAIN
     processing = {
-        "tone_contrast": look.contrast,
-        "tone_pivot": look.pivot,
-        "sharpening": look.sharpening,
+        "tone_contrast": tone.contrast,
+        "tone_pivot": tone.pivot,
+        "sharpening": tone.sharpening,
         "codec_bits_per_pixel": phone.BITS_PER_PIXEL if rules.phone else 0.0,
     }
     if not rules.phone:
@@ -156,7 +156,7 @@ def make_capture(
             (out / "truth" / folder).mkdir(parents=True)
         for stem, time, pose, own in zip(stems, times, poses, lenses, strict=True):
             light, depth = _write_sharp(
-                out / "truth" / "observed", stem, replace(setup, lens=own), pose, look
+                out / "truth" / "observed", stem, replace(setup, lens=own), pose, tone
             )
             luminances.append(phone.metered_luminance(light))
             motions.append(track_motion(path, float(time), depth, own))
@@ -171,7 +171,7 @@ def make_capture(
             (out / "truth" / "moving").mkdir()
         for number, (motion, fault, nearness) in enumerate(zip(motions, faults, nearnesses, strict=True)):
             rng = np.random.default_rng([seed, Stream.EXPOSURES, number])
-            shot, seen = _shoot(setup, rules, look, motion, fault, nearness, rng)
+            shot, seen = _shoot(setup, rules, tone, motion, fault, nearness, rng)
             shots.append(shot)
             moving = {"moving_share": float((seen > 0).mean())}
             rows.append(_row(number, images[number], motion, fault, rate) | processing | moving)
@@ -185,7 +185,7 @@ def make_capture(
         for image, shot in zip(images, shots, strict=True):
             write_rgb(out / image, shot, quality=rules.jpeg)
         for stem, pose in zip(novel_stems, novel, strict=True):
-            _write_sharp(out / "truth" / "novel", stem, setup, pose, look)
+            _write_sharp(out / "truth" / "novel", stem, setup, pose, tone)
             task.advance()
         if video:
             native = native_frames(motions, faults)
@@ -200,7 +200,7 @@ def make_capture(
                     rng = np.random.default_rng([seed, Stream.EXPOSURES, chosen, place + 1])
                     own = lens_at(lens, setup.lens, min(1.0, number / max(1, len(native) - 1)))
                     motion = replace(motion, lens=own)
-                    yield _shoot(setup, rules, look, motion, fault, nearnesses[chosen], rng)[0]
+                    yield _shoot(setup, rules, tone, motion, fault, nearnesses[chosen], rng)[0]
                     task.advance()
 
             bits = processing["codec_bits_per_pixel"] or None
@@ -244,7 +244,7 @@ def make_capture(
 def _shoot(
     setup: SceneSetup,
     rules: Protocol,
-    look: phone.Look,
+    tone: phone.Tone,
     motion: SimulatedMotion,
     fault: Fault,
     nearness: float,  # mean of 1 / depth over the pixels that see a surface
@@ -267,15 +267,15 @@ def _shoot(
         light, seen = setup.film(shutter, lens, aperture)
     if any(rules.distortion):
         light = distorted(light, lens, rules.distortion)
-    return phone.develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look), seen
+    return phone.develop(light, stops=fault.stops, noise=fault.noise, rng=rng, tone=tone), seen
 
 
 def _write_sharp(
-    folder: Path, stem: str, setup: SceneSetup, pose: ArrayF64, look: phone.Look
+    folder: Path, stem: str, setup: SceneSetup, pose: ArrayF64, tone: phone.Tone
 ) -> tuple[ArrayF64, ArrayF64]:
     """Write a sharp view and its depth. Return its linear light [H, W, 3] and camera z [H, W]."""
     light = setup.world.render(instant_shutter(pose, setup.lens.height), setup.lens)
-    write_rgb(folder / "images" / f"{stem}.png", phone.develop(light, look=look))
+    write_rgb(folder / "images" / f"{stem}.png", phone.develop(light, tone=tone))
     depth = setup.world.depth(pose, setup.lens)
     write_depth(folder / "depth" / f"{stem}.exr", depth)
     return light, depth

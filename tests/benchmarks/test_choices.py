@@ -20,7 +20,7 @@ def test_agreement_by_hand() -> None:
     rows = [
         row("restored", 20.0, 25.0, 22.0),  # best by PSNR, worst by LPIPS
         row("render", 20.0, 26.0, 22.0),  # 6 dB below the best, best by LPIPS
-        row("restored", 30.0, 31.0, 34.0),  # the raw frame was better by 3 dB
+        row("restored", 30.0, 31.0, 34.0),  # the frame image was better by 3 dB
     ]
     found = agreement(rows)
     assert (found.repaired, found.kept) == (3, 0)

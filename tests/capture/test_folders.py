@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cleargs.capture.choice import select_sharp_frames
-from cleargs.capture.prepare import read_stencil
+from cleargs.capture.prepare import read_source_mask
 from cleargs.capture.sources import externals, open_capture, whole_capture
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
@@ -165,8 +165,8 @@ def test_damaged_poses_of_apps(tmp_path: Path, frames: Frames, app: str, file: s
 def test_masks_beside_their_photographs_are_used(tmp_path: Path, frames: Frames) -> None:
     root = write(apps.masks_beside, tmp_path / "capture", frames)
     for frame in open_capture(root, IngestConfig()).frames:
-        stencil = read_stencil(frame)
-        assert stencil is not None and not stencil[:60].any() and stencil[60:].all()
+        source_mask = read_source_mask(frame)
+        assert source_mask is not None and not source_mask[:60].any() and source_mask[60:].all()
     assert len(externals(root, IngestConfig())["masks_beside"]) == 10
 
 
@@ -394,9 +394,9 @@ def test_masks_at_other_places(tmp_path: Path, frames: Frames, place: str) -> No
             tmp_path / place.format(f"{index:03d}"), np.full((240, 320, 3), 255 * (index > 0), np.uint8)
         )
     capture = open_capture(tmp_path, IngestConfig())
-    stencils = [read_stencil(frame) for frame in capture.frames]
-    assert len(stencils) == 10 and "and 10 masks" in capture.told
-    assert [None if s is None else bool(s.all()) for s in stencils] == [False] + [True] * 9
+    masks = [read_source_mask(frame) for frame in capture.frames]
+    assert len(masks) == 10 and "and 10 masks" in capture.told
+    assert [None if s is None else bool(s.all()) for s in masks] == [False] + [True] * 9
 
 
 def test_masks_with_numbers_that_start_elsewhere_are_not_guessed(tmp_path: Path, frames: Frames) -> None:
@@ -448,9 +448,14 @@ def test_panoramas_alone_are_taken(tmp_path: Path, frames: Frames) -> None:
     assert len(open_capture(root, IngestConfig(only="*skybox*")).frames) == 6
 
 
-def test_pictures_of_many_bands_alone_are_refused_by_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bands", [True, False])
+def test_pictures_of_other_channels_alone_are_refused_by_name(tmp_path: Path, bands: bool) -> None:
+    """Spectral bands, and Lab: Pillow would take its numbers for colours."""
     for index in range(4):
-        apps.write_many_bands(tmp_path / f"{index}.tif")
+        if bands:
+            apps.write_many_bands(tmp_path / f"{index}.tif")
+        else:
+            Image.new("LAB", (32, 24)).save(tmp_path / f"{index}.tif")
     with pytest.raises(InputError, match="other channels than red, green and blue") as refused:
         open_capture(tmp_path, IngestConfig())
     assert "as JPEG or PNG" in str(refused.value.hint)

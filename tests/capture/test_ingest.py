@@ -32,8 +32,9 @@ def same_bytes(first: Path, second: Path) -> bool:
     return all((first / name).read_bytes() == (second / name).read_bytes() for name in files)
 
 
-def back_to_input(out_similarity: dict[str, object], xyz: np.ndarray) -> np.ndarray:
-    scale, rotation, translation = (np.array(out_similarity[k]) for k in ("scale", "rotation", "translation"))
+def back_to_input(ingest: Path, xyz: np.ndarray) -> np.ndarray:
+    world = json.loads((ingest / "world.json").read_text())
+    scale, rotation, translation = (np.array(world[k]) for k in ("scale", "rotation", "translation"))
     return np.asarray(scale * xyz @ rotation.T + translation)
 
 
@@ -68,8 +69,8 @@ def test_given_poses_give_true_points(made: Ingested) -> None:
 
     # transforms.json speaks OpenGL cameras in the scene's own (OpenCV) world, so the way back ends in that.
     truth = np.stack([pose[:3, 3] for pose in camera_to_world(10)])
-    assert np.allclose(back_to_input(summary["similarity"], centres), truth, atol=1e-9)
-    world = back_to_input(summary["similarity"], points.xyz)
+    assert np.allclose(back_to_input(made.out, centres), truth, atol=1e-9)
+    world = back_to_input(made.out, points.xyz)
     distance = np.abs(world[:, 2:] - [depth for depth, *_ in PLANES]).min(axis=1)
     # Half a pixel at f = 300 over a 1 m baseline is about 2 cm at 4 m.
     assert len(points.xyz) > 200 and np.median(distance) < 0.01 and np.quantile(distance, 0.9) < 0.05
@@ -201,7 +202,7 @@ def test_poses_that_are_far_off_are_found_again(posed: Path, ingest: Ingest) -> 
     # In the user's world: what is left is how far the given cameras are off themselves.
     centres = np.stack([pose_of(frame).centre for frame in load_frames(done.out)])
     truth = np.stack([pose[:3, 3] for pose in camera_to_world(10)])
-    assert np.abs(back_to_input(summary["similarity"], centres) - truth).max() < 0.3
+    assert np.abs(back_to_input(done.out, centres) - truth).max() < 0.3
 
 
 def test_a_sparse_model_of_bad_poses_is_adjusted_too(shaken: Path, ingest: Ingest) -> None:
@@ -443,7 +444,7 @@ def test_matrices_of_another_convention(posed: Path, ingest: Ingest, meant: obje
     assert errors_of_poses(done.out) < (1e-4, 1e-6)
     centres = np.stack([pose_of(frame).centre for frame in load_frames(done.out)])
     truth = np.stack([pose[:3, 3] for pose in camera_to_world(10)])
-    assert np.allclose(back_to_input(done.result.summary["similarity"], centres), truth, atol=1e-9)
+    assert np.allclose(back_to_input(done.out, centres), truth, atol=1e-9)
 
 
 @pytest.mark.parametrize("focal", [250.0, 360.0])

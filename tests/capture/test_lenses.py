@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -15,7 +18,7 @@ from pydantic import ValidationError
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.kept_out import all_tracks
-from cleargs.capture.lenses import is_impossible
+from cleargs.capture.lenses import Fit, is_impossible, lens_owners
 from cleargs.capture.prediction import prediction_errors, scales_differ
 from cleargs.capture.sfm import contradictions
 from cleargs.capture.sfm_job import Prediction, SfmOutcome
@@ -96,6 +99,57 @@ def test_a_zoom_gets_a_focal_length_per_frame(tmp_path: Path, ingest: Ingest) ->
     assert figure["share"] > 0.9 and figure["median_px"] < 0.5
     frames = pq.read_table(done.out / "frames.parquet").to_pylist()
     assert sum(frame["kept_out_keypoints"] for frame in frames) == figure["keypoints"]
+    assert row["focal_range_in"] == ["view00.png", f"view{FRAMES - 1:02d}.png"]
+
+
+def test_a_change_of_lenses_gives_two_cameras(tmp_path: Path, ingest: Ingest) -> None:
+    focal = FOCAL * np.where(np.arange(FRAMES) < 7, 1.0, 1.8)
+    true = film(tmp_path / "switch", [perspective(value) for value in focal])
+    done = ingest(tmp_path / "switch")
+    assert centre_error(done, true) < 0.01
+    rows = done.result.summary["cameras"]
+    assert [row["frames"] for row in rows] == [7, 5]
+    assert [row["named"] for row in rows] == ["view00.png to view06.png", "view07.png to view11.png"]
+    np.testing.assert_allclose([row["focal_px"] for row in rows], [FOCAL, 1.8 * FOCAL], rtol=0.02)
+    assert any("px in view07.png to view11.png" in text for text in done.warnings)
+
+
+def test_wrong_matches_do_not_hide_a_better_lens(tmp_path: Path) -> None:
+    """A focal length that breathes was not found: wrong matches are a large part of the mean error."""
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=8)
+    options.num_points3D, options.num_points2D_without_point3D = 300, 0
+    with pycolmap.Database.open(tmp_path / "matches.db") as opened:
+        right = pycolmap.synthesize_dataset(options, opened)
+    tracks, random = all_tracks(tmp_path / "matches.db"), np.random.default_rng(0)
+    wrong = np.isin(tracks.track, np.unique(tracks.track)[::4])
+    tracks = replace(tracks, xy=tracks.xy + wrong[:, None] * random.uniform(-40, 40, tracks.xy.shape))
+    judged = pycolmap.Reconstruction(right)
+    for camera in judged.cameras.values():
+        camera.params = [1.001 * camera.params[0], *camera.params[1:]]
+    fit = Fit(judged, cast(Any, SimpleNamespace(tracks=tracks)), judged)
+    assert fit.error_of(right) > 0.9 * fit.error_of(judged)
+    assert fit.is_beaten_by(right)
+    assert not Fit(right, fit.adjuster, right).is_beaten_by(judged)
+
+
+def test_frames_whose_focal_lengths_are_alike_share_a_lens() -> None:
+    def owners(focal: list[float]) -> list[int]:
+        options = pycolmap.SyntheticDatasetOptions(num_rigs=len(focal), num_cameras_per_rig=1)
+        options.num_frames_per_rig, options.num_points3D = 1, 10
+        model = pycolmap.synthesize_dataset(options)
+        for image in model.images.values():
+            camera = model.cameras[image.camera_id]
+            camera.model, camera.params = (
+                pycolmap.CameraModelId.SIMPLE_RADIAL,
+                [focal[image.image_id - 1], 0, 0, 0],
+            )
+        return lens_owners(model, len(focal))
+
+    assert owners([300, 301, 299, 540, 541, 300]) == [0, 0, 0, 1, 1, 0]
+    assert owners([300, 320, 342, 365]) == [0, 1, 2, 3]
+    assert owners([300, 301, 300, 330, 360, 361]) == [0, 0, 0, 1, 2, 2]
+    breath = [300 * (1 + 0.0155 * float(np.sin(number))) for number in range(24)]
+    assert len(set(owners(breath))) in (1, 24)
 
 
 @pytest.mark.slow

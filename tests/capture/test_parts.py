@@ -20,7 +20,7 @@ from OpenImageIO import ImageOutput, ImageSpec
 from PIL import Image, ImageOps
 from pydantic import ValidationError
 
-from cleargs.capture.cameras import Intrinsics, Pose, normalise, pinhole
+from cleargs.capture.cameras import Intrinsics, Pose, Similarity, normalise, pinhole
 from cleargs.capture.capture import SourceFrame
 from cleargs.capture.choice import held_out, holdout_hash, sharpness
 from cleargs.capture.database import apply_exif_focal
@@ -29,7 +29,7 @@ from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.layouts.video import _shares, choose_times
 from cleargs.capture.matching import loop_pairs, sequential_pairs
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
-from cleargs.capture.prepare import WorkFrame, read_image, read_stencil
+from cleargs.capture.prepare import WorkFrame, read_image, read_source_mask
 from cleargs.capture.sfm import job_of
 from cleargs.capture.sources import externals, open_capture
 from cleargs.capture.undistort import MAX_TANGENT, undistorter
@@ -127,15 +127,28 @@ def test_normalised_world(scale: float, tilt: float, seed: int) -> None:
     up = -np.stack([pose.rotation[1] for pose in moved]).mean(axis=0)
     assert np.allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-9)
     assert np.isclose(np.linalg.det(similarity.rotation), 1)
-    back = similarity.to_json()
     points = random.normal(size=(5, 3))
     there = similarity.points(points)
-    again = back["scale"] * there @ np.array(back["rotation"]).T + np.array(back["translation"])
+    again = similarity.scale * there @ similarity.rotation + similarity.origin
     assert np.allclose(again, points, atol=1e-9)
     # Cameras see the same: x_camera is the same direction, nearer by the scale.
     before = points @ poses[0].rotation.T + poses[0].translation
     after = there @ moved[0].rotation.T + moved[0].translation
     assert np.allclose(after * similarity.scale, before, atol=1e-9)
+
+
+@pytest.mark.parametrize("damage", ["gone", "[]", '{"scale": 2.0, "rotation": 3, "translation": [0, 0, 0]}'])
+def test_a_run_without_its_world_names_the_remedy(tmp_path: Path, damage: str) -> None:
+    world = Similarity(np.eye(3)[[1, 2, 0]], np.array([1e6 + 0.1, 2.0, 3.0]), 1 / 3)
+    world.write(tmp_path)
+    back = Similarity.read(tmp_path)
+    assert np.array_equal(back.rotation, world.rotation) and np.array_equal(back.origin, world.origin)
+    assert back.scale == world.scale
+    (tmp_path / "world.json").unlink()
+    if damage != "gone":
+        (tmp_path / "world.json").write_text(damage)
+    with pytest.raises(InputError, match="does not say how it was normalised"):
+        Similarity.read(tmp_path)
 
 
 def test_turning_about_the_half_turn() -> None:
@@ -462,8 +475,8 @@ def test_a_camera_that_fits_the_stored_image_keeps_it_so(tmp_path: Path, orienta
     alone = SourceFrame("turned.png", path)
     turns = {1: 0, 3: 2, 6: 3}[orientation]
     assert np.array_equal(read_image(alone), np.rot90(pixels[..., :3], turns))
-    stencil = read_stencil(alone)
-    assert stencil is not None and np.array_equal(stencil > 0, np.rot90(pixels[..., 3] > 127, turns))
+    source_mask = read_source_mask(alone)
+    assert source_mask is not None and np.array_equal(source_mask > 0, np.rot90(pixels[..., 3] > 127, turns))
 
 
 def write_oriented(path: Path, pixels: np.ndarray, orientation: int) -> None:
@@ -549,7 +562,7 @@ def test_a_mask_turns_with_its_image_if_it_was_made_on_the_stored_pixels(
     for pixels, fits in ((stored, quarter or form == "a.jpg.png"), (upright, quarter or form == "a.png")):
         cv2.imwrite(str(mask), pixels)
         if fits:
-            found = read_stencil(frame)
+            found = read_source_mask(frame)
             assert found is not None and np.array_equal(found, upright)
 
 

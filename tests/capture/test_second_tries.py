@@ -6,10 +6,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import cv2
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cleargs.capture import sfm_worker
 from cleargs.capture.config import SfmConfig
+
+from .conftest import Ingest
 
 NAMES = [f"{index:02d}.png" for index in range(12)]
 
@@ -70,3 +75,19 @@ def test_what_the_second_try_places_needs_no_third() -> None:
     placer = Placer([set(range(12))])
     _, placed = placer._place_the_rest(made(set(range(8))), PAIRS)
     assert [placed[name] for name in NAMES] == ["sfm"] * 8 + ["sfm at half resolution"] * 4
+
+
+@pytest.mark.slow
+def test_a_cut_to_another_place_is_named(
+    tmp_path: Path, frames: list[tuple[NDArray[np.float64], NDArray[np.uint8]]], ingest: Ingest
+) -> None:
+    """A picture upside down and mirrored has no matches with the others."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for number, (_, image) in enumerate([*frames[:8], *frames[:6]]):
+        shown = image if number < 8 else cv2.flip(255 - image, 0)
+        cv2.imwrite(str(folder / f"view{number:02d}.png"), np.ascontiguousarray(shown))
+    done = ingest(folder)
+    assert done.result.summary["registered"] == 8
+    warning = next(text for text in done.warnings if "another place" in text)
+    assert "6 frames (view08.png to view13.png)" in warning

@@ -17,11 +17,12 @@ import numpy as np
 import pytest
 from toy import Bench
 
+from cleargs.cli.doctor import device_of
 from cleargs.cli.main import COMMANDS, cli, explanation, invoke
 from cleargs.cli.outcome_lines import outcome_lines
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.run import without_effect
-from cleargs.gpu import Check, SelfTest
+from cleargs.gpu import Check, Machine, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
 from cleargs.pipeline.config import load_config
@@ -498,10 +499,8 @@ FAILED = SelfTest(FACTS, [Check("Adam", ["means: differs by 1"], 1.0)])
 
 def test_auto_uses_a_tested_gpu_and_dry_run_tests_none(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     results = [None, PASSED]
-    monkeypatch.setattr("cleargs.pipeline.session.cuda_obstacle", lambda: None)
-    monkeypatch.setattr("cleargs.pipeline.session.current_facts", lambda: FACTS)
-    monkeypatch.setattr("cleargs.pipeline.session.cached_test", lambda facts: results[0])
-    monkeypatch.setattr("cleargs.pipeline.session.self_test", lambda facts, say: results.pop())
+    asked = Machine(lambda: None, lambda: FACTS, lambda facts: results[0], lambda facts, say: results.pop())
+    monkeypatch.setattr("cleargs.pipeline.session.Machine", lambda: asked)
     assert "device: the CPU, because the GPU is not tested yet" in shell.run("--dry-run")[2]
     assert "device: the GPU, because NVIDIA A1 passed its self-test" in shell.run()[2]
     assert 'device = "cuda"' in (shell.bench.folder / "run.toml").read_text()
@@ -518,34 +517,27 @@ def test_auto_uses_a_tested_gpu_and_dry_run_tests_none(shell: Shell, monkeypatch
     ],
 )
 def test_the_doctor_names_the_device(
-    obstacle: str | None,
-    tested: SelfTest | None,
-    state: str,
-    words: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    obstacle: str | None, tested: SelfTest | None, state: str, words: str
 ) -> None:
-    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: obstacle)
-    monkeypatch.setattr("cleargs.gpu.current_facts", lambda: FACTS)
-    monkeypatch.setattr("cleargs.gpu.cached_test", lambda facts: tested)
-    invoke(["doctor", "--json"])
-    (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "device")
-    assert found["state"] == state and found["text"].startswith(words)
+    found, report = device_of(Machine(lambda: obstacle, lambda: FACTS, lambda facts: tested), False)
+    assert (found.what, found.state, report) == ("device", state, [])
+    assert found.text.startswith(words)
 
 
 def test_the_doctor_tests_the_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: "there is no NVIDIA GPU")
+    def use(machine: Machine) -> None:
+        monkeypatch.setattr("cleargs.cli.doctor.Machine", lambda: machine)
+
+    use(Machine(lambda: "there is no NVIDIA GPU"))
     assert invoke(["doctor", "--gpu"]) == 1
     assert "bad   device" in capsys.readouterr().out
-    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: None)
-    monkeypatch.setattr("cleargs.gpu.current_facts", lambda: FACTS)
     for tested, last in (
         (PASSED, ["Adam: passed, 1.0 s", "a training step takes 2 ms on the GPU, 60 ms on the CPU"]),
         (FAILED, ["Adam: failed, 1.0 s", "  means: differs by 1"]),
     ):
-        monkeypatch.setattr("cleargs.gpu.self_test", lambda facts, say, tested=tested: tested)
+        use(Machine(lambda: None, lambda: FACTS, self_test=lambda facts, say, tested=tested: tested))
         code, lines = invoke(["doctor", "--gpu"]), capsys.readouterr().out.splitlines()
         assert lines[-2:] == last
         assert "driver: 550.54.15" in lines

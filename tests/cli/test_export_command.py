@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,20 @@ def test_a_stage_without_a_scene_is_named(
     assert export(run, tmp_path / "x.ply", "--stage", "rva") == 2
     cause, remedy = capsys.readouterr().err.splitlines()
     assert "rva has no scene" in cause and "g0" in remedy
+
+
+@pytest.mark.parametrize(("quality", "made_by"), [("draft", "g0"), ("standard", "consolidate")])
+def test_a_scene_is_named_after_the_stage_that_made_it(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quality: str, made_by: str
+) -> None:
+    """A draft has no stage after g0: they hand its scene on."""
+    shutil.copytree(run / "g0", run / "consolidate")
+    settings = (run / "run.toml").read_text()
+    (run / "run.toml").write_text(settings.replace('quality = "standard"', f'quality = "{quality}"'))
+    assert export(run, tmp_path / "x.ply") == 0
+    assert f"scene of {made_by}, " in capsys.readouterr().out
+    assert invoke(["show", str(run), "scene"]) == 0
+    assert f"scene of {made_by}: 20 Gaussians" in capsys.readouterr().out
 
 
 def test_nothing_left_to_crop_is_an_error() -> None:

@@ -132,7 +132,7 @@ def write_run(
     scene: Scene,
     views: Sequence[Camera],
     *,
-    poses: Literal["input", "sfm"] = "input",
+    poses: Literal["given", "sfm"] = "given",
     test: Sequence[int] = (),
     masked: bool = False,
     names: Sequence[str] | None = None,
@@ -169,7 +169,8 @@ def write_run(
     write_run_file(
         RunSpec(folder.absolute(), folder.absolute() / "capture", config, folder / ".store", "cpu")
     )
-    note_finished(folder, "ingest", {"poses": poses, "similarity": WORLD.to_json()})
+    WORLD.write(ingest)
+    note_finished(folder, "ingest", {"poses": poses})
     (folder / "rva").mkdir()
     note_finished(folder, "rva")
     add_scene(folder, "g0", scene)

@@ -160,7 +160,7 @@ def test_a_scene_says_how_many_of_its_views_it_was_trained_on(shell: Shell, run:
     for row in frames:
         row["split"] = "test" if row["frame_id"] in (2, 4) else "train"
     write_table(run / "ingest" / "frames.parquet", pa.Table.from_pylist(frames, FRAMES), FRAMES)
-    note_finished(run, "ingest", {"poses": "input", "similarity": WORLD.to_json()})
+    note_finished(run, "ingest", {"poses": "given"})
     code, out, _ = shell(run, "--stage", "g0", *FAST)
     assert code == 0 and out.startswith("note: 1 of 2 views are of frames that the scene was trained on\n")
     found = json.loads((run / "eval" / "holdout" / "eval.json").read_text())["evaluations"][0]

@@ -1,4 +1,4 @@
-"""A raw frame without what its camera did to it."""
+"""A frame image without what its camera did to it."""
 
 from __future__ import annotations
 

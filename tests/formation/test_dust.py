@@ -12,7 +12,7 @@ from cleargs.scene.dust import MAX_LOSS, without_dust
 from cleargs.splat.backend import mean_psnr
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.trainer import Trained
+from cleargs.splat.training import Trained
 from cleargs.splat.types import Moments
 
 

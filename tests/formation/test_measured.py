@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
 from cleargs.formation.measured import MeasuredPath, load_paths
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.observed import render_observed
 from cleargs.formation.warp import displacement_fields
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.views import TrainingView
@@ -37,7 +37,7 @@ def filmed(motions: dict[int, FrameFormation]) -> list[TrainingView]:
     made = []
     for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
         view = TrainingView(index, camera(angle), 1.0, "real", lambda: (None, None))
-        seen = render_observed(scene(), view, formation=motions.get(index)).numpy()
+        seen = render_formed(scene(), view, formation=motions.get(index)).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         made.append(TrainingView(index, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
     return made
@@ -45,7 +45,7 @@ def filmed(motions: dict[int, FrameFormation]) -> list[TrainingView]:
 
 def blurred() -> FrameFormation:
     motion = measured().exposed(EXPOSURE_S, camera(0.0))
-    return FrameFormation(BLURRED, motion, "blur", reach_px=4.0)
+    return FrameFormation(BLURRED, motion, "blur", displacement_px=4.0)
 
 
 @pytest.mark.parametrize("error", [0.0, 0.1])
@@ -53,7 +53,7 @@ def test_a_measured_blur_needs_no_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
 ) -> None:
     """Only its exposure time is unknown."""
-    monkeypatch.setattr("cleargs.formation.look.search", None)
+    monkeypatch.setattr("cleargs.formation.estimate.search", None)
     seen = filmed({BLURRED: blurred()})
     formation = CaptureFormation(seen, LOOK, measured={k: measured(error=error) for k in range(FRAMES)})
     run(tmp_path, seen, formation)
@@ -90,8 +90,8 @@ def test_a_measured_skew_is_there_from_the_first_step(tmp_path: Path, columns: b
     with_skew = run(tmp_path / "skew", seen, formation)
     without = run(tmp_path / "plain", seen, None)
     for trained, low in ((with_skew, True), (without, False)):
-        shown = render_observed(trained.scene, filmed({})[0])
-        off = float((shown - render_observed(scene(), filmed({})[0])).abs().mean())
+        shown = render_formed(trained.scene, filmed({})[0])
+        off = float((shown - render_formed(scene(), filmed({})[0])).abs().mean())
         assert (off < 0.004) == low, off
 
 
@@ -117,7 +117,7 @@ def test_frames_with_little_blur_get_the_exposure_time_of_those_around(tmp_path:
     slow = replace(measured(), path=0.2 * measured().path)
     paths = {k: slow if k == 0 else measured() for k in range(FRAMES)}
     motions = {
-        k: FrameFormation(k, path.exposed(EXPOSURE_S, camera(0.0)), "blur", reach_px=4.0)
+        k: FrameFormation(k, path.exposed(EXPOSURE_S, camera(0.0)), "blur", displacement_px=4.0)
         for k, path in paths.items()
     }
     formation = CaptureFormation(filmed(motions), LOOK, measured=paths)
@@ -151,7 +151,7 @@ def test_a_checkpoint_keeps_every_bit_of_a_formation() -> None:
     vector = np.random.default_rng(1).normal(0, 1, 36)
     vector[::5] = -0.0
     motion = FrameMotion(exposure_s=EXPOSURE_S, columns=True, median_depth=DEPTH).with_vector(vector)
-    frame = FrameFormation(3, motion, "both", misfit=0.1, skew_gain=0.2, evidence=0.05, draws=7)
+    frame = FrameFormation(3, motion, "both", residual=0.1, skew_gain=0.2, blur_gain=0.05, steps=7)
     again = next(unpacked(packed([frame])))
     assert packed([again]).tobytes() == packed([frame]).tobytes()
     assert again.motion.vector.tobytes() == vector.tobytes()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cleargs.formation.movement import Boxes, Movement, read_movement, regions, still_pixels, write_movement
+from cleargs.formation.movement import Boxes, Movement, read_movement, regions, static_pixels, write_movement
 from cleargs.splat.camera import Camera
 from cleargs.splat.types import Render
 
@@ -48,12 +48,12 @@ def movement(
 
 
 def look(
-    found: Movement, frame_id: int, target: Tensor, mask: Tensor | None = None, shown: Tensor | None = None
+    found: Movement, frame_id: int, observed: Tensor, mask: Tensor | None = None, shown: Tensor | None = None
 ) -> None:
     """Compare a frame with a wall that shows `picture`."""
     image = picture() if shown is None else shown
     alpha = torch.ones(HEIGHT, WIDTH)
-    found.look(frame_id, image, Render(image, alpha, DEPTH * alpha), 0, target, mask)
+    found.check(frame_id, image, Render(image, alpha, DEPTH * alpha), 0, observed, mask)
 
 
 def looked(targets: dict[int, Tensor], found: Movement | None = None) -> Movement:
@@ -66,7 +66,7 @@ def looked(targets: dict[int, Tensor], found: Movement | None = None) -> Movemen
 
 
 def still(found: Movement, frame_id: int, mask: Tensor | None = None) -> Tensor | None:
-    return found.still(frame_id, mask, picture())
+    return found.static_mask(frame_id, mask, picture())
 
 
 def test_noise_blur_and_another_exposure_are_not_movement() -> None:
@@ -169,5 +169,5 @@ def test_a_later_training_begins_with_the_masks_and_follows_its_own_looks() -> N
 @pytest.mark.parametrize("factor", [1, 3])
 def test_the_size_of_the_frame_does_not_matter(factor: int) -> None:
     cells = regions(np.pad(np.ones((4, 4), np.bool_), ((5, 9), (8, 20))))
-    small, large = still_pixels(cells, 36, 64), still_pixels(cells, 36 * factor, 64 * factor)
+    small, large = static_pixels(cells, 36, 64), static_pixels(cells, 36 * factor, 64 * factor)
     np.testing.assert_array_equal(large[::factor, ::factor], small)

@@ -10,8 +10,8 @@ import pytest
 from helpers.observations import picture
 
 from cleargs.formation.comparison import luminance
-from cleargs.formation.look import EVIDENCE
-from cleargs.formation.pretest import BlurEvidence, blur_evidence
+from cleargs.formation.estimate import SEARCH_GAIN
+from cleargs.formation.pretest import MissingBlur, missing_blur
 from cleargs.splat.backend import set_threads
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.types import ArrayF32
@@ -55,14 +55,14 @@ def unfinished(image: ArrayF32, sigma: float = 0.8) -> ArrayF32:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma))
 
 
-def evidence(render: ArrayF32, observed: ArrayF32) -> BlurEvidence:
-    return blur_evidence(render, noisy(observed), np.ones_like(observed))
+def missing(render: ArrayF32, observed: ArrayF32) -> MissingBlur:
+    return missing_blur(render, noisy(observed), np.ones_like(observed))
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, 2.0])
 @pytest.mark.parametrize("length", [5.0, 8.0, 14.0, 22.0])
 def test_a_sweep_has_its_length_and_direction(length: float, angle: float) -> None:
-    found = evidence(unfinished(sharp()), blurred(line(length, angle)))
+    found = missing(unfinished(sharp()), blurred(line(length, angle)))
     assert found.gain == found.line_gain > 0.5
     assert found.line_gain > found.disc_gain
     # A soft render leaves the shortest part of a blur unseen.
@@ -72,7 +72,7 @@ def test_a_sweep_has_its_length_and_direction(length: float, angle: float) -> No
 
 @pytest.mark.parametrize("radius", [3.0, 5.0])
 def test_a_disc_explains_more_than_a_line(radius: float) -> None:
-    found = evidence(unfinished(sharp()), blurred(disc(radius)))
+    found = missing(unfinished(sharp()), blurred(disc(radius)))
     assert found.gain == found.disc_gain > found.line_gain
     assert 2.0 * math.sqrt(found.disc) == pytest.approx(radius, rel=0.25)
 
@@ -80,11 +80,11 @@ def test_a_disc_explains_more_than_a_line(radius: float) -> None:
 @pytest.mark.parametrize("sigma", [0.3, 0.8, 2.0])
 def test_a_sharp_frame_gives_no_evidence(sigma: float) -> None:
     """The softer the render, the farther the frame is from being blurrier."""
-    assert evidence(unfinished(sharp(), sigma), sharp()).gain < EVIDENCE
+    assert missing(unfinished(sharp(), sigma), sharp()).gain < SEARCH_GAIN
 
 
 def test_another_exposure_is_no_blur() -> None:
-    assert evidence(unfinished(sharp()), np.asarray(0.7 * sharp() + 0.05, np.float32)).gain < EVIDENCE
+    assert missing(unfinished(sharp()), np.asarray(0.7 * sharp() + 0.05, np.float32)).gain < SEARCH_GAIN
 
 
 def test_a_small_misregistration_is_no_blur() -> None:
@@ -92,16 +92,16 @@ def test_a_small_misregistration_is_no_blur() -> None:
     shift = np.array([[1, 0, 0.3], [0, 1, 0.2]], np.float32)
     size = (sharp().shape[1], sharp().shape[0])
     moved = cv2.warpAffine(sharp(), shift, size, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-    assert evidence(unfinished(sharp()), np.asarray(moved)).gain < EVIDENCE
+    assert missing(unfinished(sharp()), np.asarray(moved)).gain < SEARCH_GAIN
 
 
 def test_nothing_to_see_gives_no_evidence() -> None:
     flat = np.full((60, 80), 0.5, np.float32)
-    assert blur_evidence(flat, flat, np.ones_like(flat)).gain == 0.0
-    assert blur_evidence(sharp(), blurred(line(9.0, 0.0)), np.zeros_like(sharp())).gain == 0.0
+    assert missing_blur(flat, flat, np.ones_like(flat)).gain == 0.0
+    assert missing_blur(sharp(), blurred(line(9.0, 0.0)), np.zeros_like(sharp())).gain == 0.0
     for size in ((2, 3), (3, 3), (9, 300)):
         image = np.random.default_rng(0).random(size).astype(np.float32)
-        assert math.isfinite(blur_evidence(image, image[::-1].copy(), np.ones_like(image)).gain)
+        assert math.isfinite(missing_blur(image, image[::-1].copy(), np.ones_like(image)).gain)
 
 
 def test_pixels_without_weight_say_nothing() -> None:
@@ -110,7 +110,7 @@ def test_pixels_without_weight_say_nothing() -> None:
     weight[40:90, 60:120] = 0.0
     spoilt = observed.copy()
     spoilt[60:70, 85:95] = 1.0  # far enough from what counts that no smoothing carries it there
-    clean, ruined = (blur_evidence(sharp(), image, weight) for image in (observed, spoilt))
+    clean, ruined = (missing_blur(sharp(), image, weight) for image in (observed, spoilt))
     assert ruined.length == pytest.approx(clean.length, rel=0.02)
 
 
@@ -118,7 +118,7 @@ def test_threads_do_not_change_a_bit() -> None:
     found = []
     for threads in (1, 2):
         set_threads(threads)
-        found.append(evidence(sharp(), blurred(line(8.0, 0.6))))
+        found.append(missing(sharp(), blurred(line(8.0, 0.6))))
     assert found[0] == found[1]
 
 

@@ -163,11 +163,11 @@ def test_threads_do_not_change_a_bit(truth: Image) -> None:
         set_threads(threads)
         found.append(preferred(search(frame_pair(soft(truth), observe(truth, BOTH)))))
     np.testing.assert_array_equal(found[0].motion.vector, found[1].motion.vector)
-    assert found[0].misfit == found[1].misfit
+    assert found[0].residual == found[1].residual
 
 
 @pytest.mark.parametrize("curved", [False, True], ids=["straight", "curved"])
-def test_misfits_count_what_has_a_weight_and_nothing_else(curved: bool) -> None:
+def test_residuals_count_what_has_a_weight_and_nothing_else(curved: bool) -> None:
     """Against interpolation in float64; where a pixel has no weight, nothing that is not finite gets out."""
     rng = np.random.default_rng(4)
     height, width, limit = 9, 13, 0.3
@@ -184,7 +184,7 @@ def test_misfits_count_what_has_a_weight_and_nothing_else(curved: bool) -> None:
         field[:, unseen] = np.nan
     rows = np.full(height, np.nan)
     curve = bent if curved else None
-    kernels.misfits(image, observed, weight, offset, sweep, radius, curve, samples, limit, rows)
+    kernels.residuals(image, observed, weight, offset, sweep, radius, curve, samples, limit, rows)
 
     expected = np.zeros(height)
     for y, x in zip(*np.nonzero(weight), strict=True):
@@ -202,7 +202,7 @@ def test_misfits_count_what_has_a_weight_and_nothing_else(curved: bool) -> None:
     np.testing.assert_allclose(rows, expected, atol=5e-6)
 
 
-def test_the_equations_have_the_slopes_of_the_misfit() -> None:
+def test_the_equations_have_the_slopes_of_the_residual() -> None:
     """All 30 numbers of a curved motion, against finite differences of the squared difference."""
     y, x = np.indices((HEIGHT, WIDTH), np.float32)
     # Waves that are long against a pixel, so that slopes and interpolation of the images are good.

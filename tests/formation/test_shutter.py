@@ -132,10 +132,10 @@ def test_a_frame_at_a_long_or_a_short_gap_has_no_speed() -> None:
 )
 def test_a_skew_is_added_to_what_a_frame_has(before: Model, after: Model) -> None:
     had = FrameMotion(skew=np.full(6, 0.5), median_depth=DEPTH)
-    frame = with_skew(FrameFormation(3, had, before, reach_px=2.0), NEEDED * REST)
+    frame = with_skew(FrameFormation(3, had, before, displacement_px=2.0), NEEDED * REST)
     assert frame.model == after
     np.testing.assert_allclose(frame.motion.skew, NEEDED + 0.5)
-    assert frame.reach_px == 2.0 + 0.5 * 9.5, "no pixel at the median depth moves farther"
+    assert frame.displacement_px == 2.0 + 0.5 * 9.5, "no pixel at the median depth moves farther"
 
 
 def test_a_defocused_frame_stays_as_it_is() -> None:

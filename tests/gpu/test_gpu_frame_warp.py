@@ -23,7 +23,9 @@ from cleargs.splat.backend import backend_for
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST
-from cleargs.splat.trainer import Trained, Trainer
+from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import Trained
+from cleargs.splat.training import run as run_training
 
 Both = Callable[..., tuple[Any, Any]]
 
@@ -111,7 +113,7 @@ def test_a_training_through_the_warp_follows_the_cpu(
         "defocus": FrameMotion(disc_px=1.2, focus=1.4, **depth),
     }
     known = {
-        index: FrameFormation(index, motion, model, misfit=0.1, misfit_still=0.2, reach_px=3.0)
+        index: FrameFormation(index, motion, model, residual=0.1, residual_without=0.2, displacement_px=3.0)
         for index, (model, motion) in enumerate(motions.items())
     }
     config = TrainConfig(steps=3, densify=False, coarse_share=0.0, lr_means=2e-3)
@@ -120,7 +122,7 @@ def test_a_training_through_the_warp_follows_the_cpu(
         formation = CaptureFormation(views, FormationConfig(start=0.0), known=known)
         assert [frame.model for frame in formation.frames.values()] == list(motions)
         trainer = Trainer(splat_toy.start(6), views, config, seed=(7,), formation=formation, device=where)
-        return trainer.run(checkpoint=tmp_path / "state.safetensors", reporter=SilentReporter())
+        return run_training(trainer, checkpoint=tmp_path / "state.safetensors", reporter=SilentReporter())
 
     on_gpu = trained(str(device))
     with monkeypatch.context() as patch:

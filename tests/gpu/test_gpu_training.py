@@ -21,6 +21,7 @@ from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.state import load_state
 from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import run as run_training
 from cleargs.splat.types import Moments
 from cleargs.splat.views import ImageCache
 
@@ -128,7 +129,7 @@ def toy(monkeypatch):
 def trained_on(device, views, folder, *, config=CONFIG, formation=None):
     scene = splat_toy.start(12, sh_degree=1)
     trainer = Trainer(scene, views, config, seed=(7,), formation=formation, device=str(device))
-    return trainer.run(checkpoint=folder / "state.safetensors", reporter=SilentReporter())
+    return run_training(trainer, checkpoint=folder / "state.safetensors", reporter=SilentReporter())
 
 
 def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_path):

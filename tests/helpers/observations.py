@@ -63,7 +63,7 @@ def soft(image: Image, sigma: float = 0.7) -> Image:
 
 
 def frame_pair(render: Image, observed: Image, weight: Image = ALPHA) -> FramePair:
-    """The pair of the raw frame ``observed`` and its render, without a margin."""
+    """The pair of the frame image ``observed`` and its render, without a margin."""
     seen = np.where(weight[..., None] > 0, observed, render)
     return FramePair(luminance(render), wall(), ALPHA, luminance(seen), weight, CAMERA, 0)
 

@@ -14,7 +14,7 @@ from PIL import Image, ImageCms
 from PIL.TiffImagePlugin import IFDRational
 
 from cleargs.errors import InputError
-from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.media.colour import linear_from_srgb, srgb_from_hdr, srgb_from_linear
 from cleargs.media.image import image_size, read_alpha, read_rgb, stated_focal
 
 P3_FROM_SRGB = np.array([[0.8225, 0.1774, 0.0], [0.0332, 0.9669, 0.0], [0.0171, 0.0724, 0.9108]])
@@ -221,6 +221,25 @@ def test_a_grey_profile_is_converted(tmp_path: Path) -> None:
     assert abs(int(read_rgb(tmp_path / "a.png")[0, 0, 0]) - expected) <= 2
 
 
+def test_a_profile_of_inks_is_converted(tmp_path: Path) -> None:
+    """As programs for print save JPEGs. Each ink of this one halves the lightness, and black takes all."""
+    inks = np.indices((2, 2, 2, 2)).reshape(4, 16)
+    lightness = 255 * 0.5 ** inks[:3].sum(axis=0) * (1 - inks[3])
+    colours = np.stack([lightness, np.full(16, 128), np.full(16, 128)], axis=1).astype(np.uint8)
+    ramp, identity = bytes(range(256)), struct.pack(">9i", *(np.eye(3, dtype=int) * 65536).ravel())
+    table = b"mft1" + bytes(4) + bytes([4, 3, 2, 0]) + identity + 4 * ramp + colours.tobytes() + 3 * ramp
+    head = bytearray(128)
+    struct.pack_into(">I4xI4s4s4s", head, 0, 144 + len(table), 0x02400000, b"prtr", b"CMYK", b"Lab ")
+    head[36:40] = b"acsp"
+    struct.pack_into(">3i", head, 68, 63190, 65536, 54061)
+    profile = bytes(head) + struct.pack(">I4sII", 1, b"A2B0", 144, len(table)) + table
+    shown = []
+    for ink in ((0, 0, 0, 0), (255, 0, 0, 0), (0, 0, 0, 255)):
+        Image.new("CMYK", (16, 16), ink).save(tmp_path / "a.jpg", icc_profile=profile, quality=100)
+        shown.append(read_rgb(tmp_path / "a.jpg")[8, 8].tolist())
+    assert np.abs(np.array(shown) - np.array([[255] * 3, [119] * 3, [0] * 3])).max() <= 2
+
+
 def test_a_photograph_for_3d_screens_is_its_first_picture(tmp_path: Path) -> None:
     second = Image.fromarray(stripes()[::-1].copy())
     Image.fromarray(stripes()).save(
@@ -252,3 +271,31 @@ def test_the_first_picture_of_several_is_read(tmp_path: Path, name: str) -> None
     Image.fromarray(stripes()).save(tmp_path / name, kind, save_all=True, append_images=[other], quality=95)
     assert image_size(tmp_path / name) == (64, 40)
     assert np.abs(read_rgb(tmp_path / name).astype(int) - stripes())[5:15, 4::16].max() < 12
+
+
+@pytest.mark.parametrize(("transfer", "code"), [("pq", 16), ("hlg", 18)])
+@pytest.mark.parametrize("suffix", [".HIF", ".avif"])
+def test_hdr_photographs_are_tone_mapped(tmp_path: Path, suffix: str, transfer: str, code: int) -> None:
+    """As Canon's and Sony's cameras write them."""
+    path, levels = tmp_path / f"a{suffix}", np.array([40, 90, 150, 200], np.uint8)
+    picture = Image.fromarray(np.repeat(np.repeat(levels[None, :, None], 40, 0), 16, 1).repeat(3, 2))
+    if suffix == ".HIF":
+        heif = pytest.importorskip("pillow_heif", reason="the extra cleargs[heif] is not installed")
+        signal = {"color_primaries": 9, "transfer_characteristics": code, "matrix_coefficients": 9}
+        heif.from_pillow(picture).save(path, quality=100, full_range_flag=1, **signal)
+    else:
+        picture.save(path, quality=100)
+        data = path.read_bytes()
+        place = data.index(b"colrnclx") + 8
+        path.write_bytes(data[:place] + struct.pack(">HH", 9, code) + data[place + 4 :])
+    expected = 255 * srgb_from_hdr(np.repeat(levels[None, :, None] / 255.0, 3, 2), transfer)
+    assert np.abs(read_rgb(path)[20, 8::16] - expected[0]).max() < 5
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_measured_numbers_are_no_photograph(tmp_path: Path, kind: type[np.generic]) -> None:
+    """As programs of thermal cameras export them: they would all be black or all white."""
+    Image.fromarray(np.full((24, 32), 293, kind)).save(tmp_path / "a.tif")
+    with pytest.raises(InputError, match="not colours") as refused:
+        read_rgb(tmp_path / "a.tif")
+    assert "8 or 16 bits" in str(refused.value.hint)

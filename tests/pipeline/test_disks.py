@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from toy import Bench
 
 from cleargs.cli.main import invoke
 from cleargs.errors import StoreError
+from cleargs.pipeline import runner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.session import opened_store, resolve_run
 from cleargs.progress import SilentReporter
@@ -45,6 +47,40 @@ def test_a_run_on_a_disk_without_links(bench: Bench) -> None:
     bench.run("square.power=2")
     assert text(bench) == first
     assert not [path for path in bench.folder.iterdir() if "link-" in path.name]
+
+
+@pytest.mark.usefixtures("no_links")
+def test_the_copied_scene_follows_the_run(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "SCENE", "total.txt")
+    scene = bench.folder / "total.txt"
+    for power in (2, 3, 3, 2):
+        bench.run(f"square.power={power}")
+        assert scene.read_text() == text(bench) and bench.remarks.warnings == []
+    bench.run("square.power=3", until="square")
+    assert not scene.exists()
+
+
+@pytest.mark.usefixtures("no_links")
+def test_a_scene_of_the_user_stays_on_a_disk_without_links(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "SCENE", "total.txt")
+    bench.run()
+    (bench.folder / "total.txt").write_text("edited")
+    bench.run("square.power=3")
+    assert (bench.folder / "total.txt").read_text() == "edited"
+    assert any("was not made by ClearGS" in line for line in bench.remarks.warnings)
+
+
+@pytest.mark.usefixtures("no_links")
+@pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_text("x")])
+def test_a_damaged_copy_is_made_again(bench: Bench, damage: Callable[[Path], object]) -> None:
+    bench.run()
+    whole = text(bench)
+    damage(bench.folder / "total/total.txt")
+    assert invoke(["verify", str(bench.folder)], bench.dag) == 1
+    assert [outcome.how for outcome in bench.run()] == ["found"] * 3
+    assert text(bench) == whole and invoke(["verify", str(bench.folder)], bench.dag) == 0
 
 
 @pytest.mark.usefixtures("no_links")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,8 +12,7 @@ from toy import Bench, Square
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError, StageError
-from cleargs.gpu import NO_GPU, Check, SelfTest
-from cleargs.pipeline import session
+from cleargs.gpu import NO_GPU, Check, Machine, SelfTest
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.session import resolve_device
 from cleargs.pipeline.stage import StageContext, StageResult
@@ -28,16 +26,9 @@ FAILED = SelfTest(FACTS, [Check("Adam", ["means: differs by 1"], 1.0)], gpu_ms=2
 SLOW = PASSED._replace(gpu_ms=90.0)
 
 
-@pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> Callable[[SelfTest | None], None]:
-    """Return a function that sets the cached result of the self-test."""
-
-    def known(tested: SelfTest | None) -> None:
-        monkeypatch.setattr(session, "cuda_obstacle", lambda: None)
-        monkeypatch.setattr(session, "current_facts", lambda: FACTS)
-        monkeypatch.setattr(session, "cached_test", lambda facts: tested)
-
-    return known
+def machine(tested: SelfTest | None, obstacle: str | None = None) -> Machine:
+    """A machine with a GPU, and with this cached result of its self-test. A new test would pass."""
+    return Machine(lambda: obstacle, lambda: FACTS, lambda facts: tested, lambda facts, say: PASSED)
 
 
 # -- the choice --------------------------------------------------------------------------------------------
@@ -67,51 +58,42 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Callable[[SelfTest | None], None]:
         (None, "cpu", "device: the CPU, because the GPU is not tested yet (cleargs doctor --gpu tests it)"),
     ],
 )
-def test_auto_says_in_one_line_what_it_chose(
-    tested: SelfTest | None, device: str, line: str, gpu: Callable[[SelfTest | None], None]
-) -> None:
-    gpu(tested)
+def test_auto_says_in_one_line_what_it_chose(tested: SelfTest | None, device: str, line: str) -> None:
     lines: list[str] = []
-    assert resolve_device("auto", lines.append) == device
+    asked = machine(tested)
+    assert resolve_device("auto", lines.append, machine=asked) == device
     assert lines == [line]
-    assert resolve_device("cpu", lines.append) == "cpu"
-    assert resolve_device("cuda", lines.append) == "cuda"
+    assert resolve_device("cpu", lines.append, machine=asked) == "cpu"
+    assert resolve_device("cuda", lines.append, machine=asked) == "cuda"
     assert lines == [line]
 
 
-def test_auto_tests_a_gpu_that_is_new(
-    gpu: Callable[[SelfTest | None], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gpu(None)
-    monkeypatch.setattr(session, "self_test", lambda facts, say: PASSED)
-    assert resolve_device("auto", lambda line: None) == "cpu"
-    assert resolve_device("auto", lambda line: None, test=True) == "cuda"
+def test_auto_tests_a_gpu_that_is_new() -> None:
+    asked = machine(None)
+    assert resolve_device("auto", lambda line: None, machine=asked) == "cpu"
+    assert resolve_device("auto", lambda line: None, test=True, machine=asked) == "cuda"
 
 
-def test_without_a_gpu_there_is_no_test_and_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*given: object) -> None:
+def test_without_a_gpu_there_is_no_test_and_no_message() -> None:
+    def refuse() -> dict[str, str]:
         raise AssertionError("there is no GPU to ask")
 
-    monkeypatch.setattr(session, "cuda_obstacle", lambda: NO_GPU)
-    monkeypatch.setattr(session, "current_facts", refuse)
     lines: list[str] = []
-    assert resolve_device("auto", lines.append, test=True) == "cpu"
+    none = Machine(lambda: NO_GPU, refuse)
+    assert resolve_device("auto", lines.append, test=True, machine=none) == "cpu"
     assert not lines
-    monkeypatch.setattr(session, "cuda_obstacle", lambda: "Triton is not installed")
-    assert resolve_device("auto", lines.append, test=True) == "cpu"
+    useless = Machine(lambda: "Triton is not installed", refuse)
+    assert resolve_device("auto", lines.append, test=True, machine=useless) == "cpu"
     assert lines == ["device: the CPU, because Triton is not installed"]
 
 
-def test_a_run_keeps_its_device(gpu: Callable[[SelfTest | None], None]) -> None:
+def test_a_run_keeps_its_device() -> None:
     lines: list[str] = []
-    gpu(PASSED)
-    assert resolve_device("auto", lines.append, kept="cpu") == "cpu"
-    gpu(SLOW)
-    assert resolve_device("auto", lines.append, kept="cuda") == "cuda"
-    gpu(FAILED)
-    assert resolve_device("cuda", lines.append, kept="cuda") == "cuda"
+    assert resolve_device("auto", lines.append, kept="cpu", machine=machine(PASSED)) == "cpu"
+    assert resolve_device("auto", lines.append, kept="cuda", machine=machine(SLOW)) == "cuda"
+    assert resolve_device("cuda", lines.append, kept="cuda", machine=machine(FAILED)) == "cuda"
     with pytest.raises(InputError, match="the run used the GPU, but the GPU failed") as caught:
-        resolve_device("auto", lines.append, kept="cuda")
+        resolve_device("auto", lines.append, kept="cuda", machine=machine(FAILED))
     assert "--device cpu" in caught.value.hint
     assert not lines
 

@@ -156,9 +156,7 @@ def test_poses_that_were_written_give_the_same_images(run: Path, tmp_path: Path)
     (tmp_path / "cameras.json").write_text(json.dumps(cameras_json(named)))
     transforms = {"frames": [{"transform_matrix": to_input(view).tolist()} for view in views]}
     (tmp_path / "transforms.json").write_text(json.dumps(transforms))
-    inverse = WORLD.to_json()
-    del inverse["definition"]
-    moved = cameras_json(named, **{name: np.array(value) for name, value in inverse.items()})
+    moved = cameras_json(named, scale=WORLD.scale, rotation=WORLD.rotation.T, translation=WORLD.origin)
     (tmp_path / "input.json").write_text(json.dumps(moved))
     for number, (name, more) in enumerate(
         [("cameras.json", []), ("transforms.json", []), ("input.json", ["--world", "input"])]

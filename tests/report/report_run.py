@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import torch
 
+from cleargs.capture.cameras import Similarity
 from cleargs.capture.tables import FRAMES
 from cleargs.digest import file_digest, tree_digest
 from cleargs.formation.exposure import Exposure, write_exposure
@@ -171,10 +172,8 @@ class FinishedRun:
             )
         write_table(folder / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
         turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-        similarity = {"scale": 2.5, "rotation": turn.tolist(), "translation": [1.0, -2.0, 3.0]}
-        self.finish(
-            "ingest", {"frames": COUNT, "frames_available": COUNT, "registered": 6, "similarity": similarity}
-        )
+        Similarity(turn.T, np.array([1.0, -2.0, 3.0]), 2.5).write(folder)
+        self.finish("ingest", {"frames": COUNT, "frames_available": COUNT, "registered": 6})
 
     def _rva(self) -> None:
         (self.folder / "rva").mkdir()
@@ -185,10 +184,10 @@ class FinishedRun:
             row |= {f"r_{name}": 0.9 for name in R_CUES}
             row |= {"frame_id": index, "name": "", "evaluator": "test-1", "R": 0.8, "B": 0.1, "G": 0.3}
             row |= {"role": ROLES[index], "weight": WEIGHTS[index], "b_motion_blur": 0.7, "reliable": True}
-            row |= {"stand_in": False}
+            row |= {"fallback": False}
             rows.append(row)
         write_table(self.folder / "rva/frames.parquet", pa.Table.from_pylist(rows, RVA_FRAMES), RVA_FRAMES)
-        self.finish("rva", {"effective_frames": 2.7, "bins_uncovered_before": 1, "stand_in": 0})
+        self.finish("rva", {"effective_frames": 2.7, "bins_uncovered_before": 1, "fallback": 0})
 
     def _trained(self, stage: str, summary: dict[str, Any]) -> None:
         folder = self.folder / stage
@@ -243,7 +242,7 @@ class FinishedRun:
                     primary={"render": 80.0, "restored": 85.0 + index, "observed": 75.0},
                     tiebreak_metric="natural-1",
                     tiebreak={"render": 70.0, "restored": 71.0, "observed": 72.0},
-                    restored_from="observation",
+                    restored_from="observed",
                     blur_px=2.0 * index,
                     skew_px=0.3,
                     chosen="restored",

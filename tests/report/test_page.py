@@ -53,8 +53,8 @@ def test_a_frame_that_was_not_tried_says_why() -> None:
     ("poses", "errors", "expected"),
     [
         ("given", None, ("given", None, None)),
-        ("input", {"given": 0.9, "adjusted": 0.8}, ("given", 0.9, 0.9)),
-        ("refined", {"given": 1.7, "adjusted": 0.3}, ("adjusted", 1.7, 0.3)),
+        ("given", {"given": 0.9, "adjusted": 0.8}, ("given", 0.9, 0.9)),
+        ("adjusted", {"given": 1.7, "adjusted": 0.3}, ("adjusted", 1.7, 0.3)),
         ("sfm", {"given": 1.7, "adjusted": 0.6, "sfm": 0.3}, ("sfm over given", 1.7, 0.3)),
         ("sfm", None, ("sfm", None, None)),
     ],

@@ -47,7 +47,7 @@ def test_a_frame_in_words_fits_100_columns(
     assert "pose camera at (-0.200, 0.060, " in words
     assert "role by RVA geometric, weight 0.40: B > 0.6, adds views" not in words  # R 0.8 and B 0.1 pass
     assert "R 0.80, B 0.10, G 0.30" in words and "worst cue motion blur 0.70" in words
-    assert "motion blur, explains 62 % of the misfit" in words
+    assert "motion blur, explains 62 % of the residual" in words
     assert "blur 3.25 px, rolling shutter 0.00 px" in words
     assert "weight 0.40 before image formation, 0.75 after it" in words
     assert "round 1 the restored frame (primary score)" in words

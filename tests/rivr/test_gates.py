@@ -65,7 +65,7 @@ def test_a_perfect_repair_is_admitted(sharp: ImageF32, observed: ImageF32, rende
 
 
 def test_either_witness_suffices(sharp: ImageF32, observed: ImageF32, render: ImageF32) -> None:
-    """A repair may be aligned with the raw frame and not with the render, or the reverse."""
+    """A repair may be aligned with the frame image and not with the render, or the reverse."""
     off = np.roll(render, 4, axis=0)
     assert rejection_reason(sharp, observed, off, LIMITS) is None
     assert rejection_reason(np.roll(sharp, 4, axis=0), observed, off, LIMITS) is None
@@ -102,7 +102,7 @@ def test_one_bad_block_shows_but_does_not_condemn_the_rest(
 
 
 def test_along_heavy_blur_the_place_is_uncertain(sharp: ImageF32, render: ImageF32) -> None:
-    """A shift by 2 px along 15 px of motion explains the raw frame as well; across the motion it does not."""
+    """A shift by 2 px along 15 px of motion explains the frame as well; across the motion it does not."""
     observed = cv2.blur(sharp, (15, 1))
     assert rejection_reason(np.roll(sharp, 2, axis=1), observed, render, LIMITS) is None
     assert rejection_reason(np.roll(sharp, 2, axis=0), observed, render, LIMITS) is not None

@@ -123,7 +123,7 @@ def test_even_draws_raw_and_repaired_views_alike(capture: Capture) -> None:
     context = capture.context("rivr", tiny_rivr(rounds=1, distil=distil))
     rivr.run(context)
     kinds = logged(context)["kind"]
-    # 7 repairs and the 6 active raw frames: ten epochs of the union
+    # 7 repairs and the 6 active frame images: ten epochs of the union
     assert (kinds.count("pseudo"), kinds.count("real")) == (70, 60)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, harm_of
+from cleargs.rivr.harm import Fidelity, HarmCheck, HarmConfig, compare_on_controls
 
 
 def checked(psnr: float, score: float) -> HarmCheck:
     before, after = Fidelity(25.0, 65.0), Fidelity(25.0 + psnr, 65.0 + score)
-    return harm_of([3, 9], before, after, HarmConfig(psnr_margin=0.5, score_margin=1.0))
+    return compare_on_controls([3, 9], before, after, HarmConfig(psnr_margin=0.5, score_margin=1.0))
 
 
 def test_small_losses_are_no_harm() -> None:
@@ -30,4 +30,6 @@ def test_a_check_has_the_figures_that_decided() -> None:
 
 
 def test_without_held_back_frames_there_is_no_harm() -> None:
-    assert harm_of([], None, None, HarmConfig()) == HarmCheck([], None, None, None, None, harm=None)
+    assert compare_on_controls([], None, None, HarmConfig()) == HarmCheck(
+        [], None, None, None, None, harm=None
+    )

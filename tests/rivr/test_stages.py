@@ -166,13 +166,13 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
     context = capture.context("rivr", tiny_rivr(undo_motion=True))
     rivr.run(context)
     rows = tried_rows(context)
-    sharp = {row.frame_id for row in rows if row.restored_from == "observation"}
+    sharp = {row.frame_id for row in rows if row.restored_from == "observed"}
     # Every round renders, and so deblurs, again; a frame that nothing explains is restored once as it is.
     assert expert.calls == sum(row.restored_from == "deblurred" for row in rows) + len(sharp)
     blur = dict.fromkeys(((n, k) for n in (1, 2) for k in TARGETS), 0.0)
     for row in rows:
         exr = read_exr(context.out / row.exr, "cleargs:")
-        if row.restored_from == "observation":
+        if row.restored_from == "observed":
             assert row.blur_px is None
             continue
         assert row.blur_px is not None
@@ -206,7 +206,7 @@ class Faithful:
 
 
 def keeping(**changes: Any) -> Any:
-    """Return the default settings: motion undone, no fusion, raw frames kept.
+    """Return the default settings: motion undone, no fusion, frame images kept.
 
     The stand-in scorers have no calibrated scale. The margin leaves the choice to them only where they differ
     much.
@@ -221,7 +221,7 @@ PLAIN = tiny_g0(formation={"enabled": False}, background=(0.0, 0.0, 0.0))
 def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It keeps its raw frame, the EXR shows how it is explained, and no repair of it is drawn."""
+    """It keeps its frame image, the EXR shows how it is explained, and no repair of it is drawn."""
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
     capture.use_good_scene()
     blurred = 2
@@ -230,7 +230,7 @@ def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
         for k in TARGETS
     ]
     motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
-    known = {blurred: FrameFormation(blurred, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0)}
+    known = {blurred: FrameFormation(blurred, motion, "blur", 0.001, 0.01, 6.0, displacement_px=3.0)}
     weights = {view.frame_id: view.weight for view in views}
     formation = CaptureFormation(views, FormationConfig(), known=known)
     write_formation(capture.root / "g0" / "formation.parquet", formation, weights)
@@ -253,7 +253,7 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
     """From what the training has found: nothing is estimated again."""
     capture.use_good_scene()
     motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
-    found = FrameFormation(2, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0, draws=30)
+    found = FrameFormation(2, motion, "blur", 0.001, 0.01, 6.0, displacement_px=3.0, steps=30)
     supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
     view = supervision.views[2]
     formation = CaptureFormation([view], FormationConfig(), known={2: found})
@@ -287,7 +287,7 @@ def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pyte
 
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sharp frames are kept and supervise as raw frames alone; blurred ones get repairs."""
+    """Sharp frames are kept and supervise as frame images alone; blurred ones get repairs."""
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
     capture.use_good_scene()
     context = capture.context("rivr", keeping(), g0=PLAIN)
@@ -439,7 +439,7 @@ def test_without_rounds_the_first_scene_stays(capture: Capture) -> None:
 def test_a_round_in_which_nothing_is_taken_ends_the_rounds(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its training takes the steps of the rounds that are left, on the raw frames."""
+    """Its training takes the steps of the rounds that are left, on the frame images."""
     lines: list[str] = []
     monkeypatch.setattr(SilentReporter, "info", lambda reporter, text: lines.append(text))
     monkeypatch.setattr(rounds, "decide", lambda *args, **facts: decide(*args, **facts | {"masked": True}))

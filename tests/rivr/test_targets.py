@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 
 from cleargs.formation.frame import FrameFormation
-from cleargs.rivr.need import frames_to_repair, rows_of_others
+from cleargs.rivr.need import frames_to_repair, untried_rows
 from cleargs.rivr.targets import FrameAssessment, Supervision, select_controls
 
 
-def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[FrameAssessment]:
+def appraised(roles: list[str], fallback: set[int] | None = None) -> list[FrameAssessment]:
     """One frame a role, with ids 10, 11, ..."""
     return [
         FrameAssessment(
-            10 + k, R=0.5, B=0.5, role=role, reliable=role == "strong", stand_in=10 + k in (stand_in or set())
+            10 + k, R=0.5, B=0.5, role=role, reliable=role == "strong", fallback=10 + k in (fallback or set())
         )
         for k, role in enumerate(roles)
     ]
@@ -35,13 +35,16 @@ def test_all_takes_every_frame_but_the_held_back() -> None:
     assert frames_to_repair("all", supervision(), {}) == [10, 11, 12, 14, 15]
 
 
-def found(**misfits: float) -> dict[int, FrameFormation]:
-    """Formations of frames ``f10``, ``f11``, ... with these misfits, of which none has a model."""
-    return {int(name[1:]): FrameFormation(int(name[1:]), misfit=misfit) for name, misfit in misfits.items()}
+def found(**residuals: float) -> dict[int, FrameFormation]:
+    """Formations of frames ``f10``, ``f11``, ... with these residuals, of which none has a model."""
+    return {
+        int(name[1:]): FrameFormation(int(name[1:]), residual=residual)
+        for name, residual in residuals.items()
+    }
 
 
 def test_auto_takes_what_formation_and_rva_leave_in_need() -> None:
-    """Frame 12 is suppressed, 14 reactivated without a model, 11 has three times the median misfit."""
+    """Frame 12 is suppressed, 14 reactivated without a model, 11 has three times the median residual."""
     formations = found(f10=0.01, f11=0.03, f13=0.01, f14=0.01, f15=0.01)
     assert frames_to_repair("auto", supervision(), formations) == [11, 12, 14]
     formations[14] = replace(formations[14], model="blur", blur_px=5.0)
@@ -58,7 +61,7 @@ def test_auto_tries_two_frames_at_least_and_a_sixteenth_of_many() -> None:
 
 def test_every_frame_that_is_not_tried_says_why_it_is_kept() -> None:
     formations = found(f10=0.01) | {11: FrameFormation(11, model="blur", blur_px=5.2)}
-    rows = {row.frame_id: row for row in rows_of_others([12, 14, 15], supervision(), formations)}
+    rows = {row.frame_id: row for row in untried_rows([12, 14, 15], supervision(), formations)}
     assert {frame_id: row.reason for frame_id, row in rows.items()} == {
         10: "not tried: needs no repair",
         11: "not tried: explained: blur 5.2 px",
@@ -90,6 +93,6 @@ def test_the_sharpest_of_each_part_is_held_back() -> None:
 
 
 def test_the_stand_in_set_replaces_missing_strong_frames() -> None:
-    assert select_controls(appraised(["suppressed"] * 5, stand_in={12})) == [12]
-    assert select_controls(appraised(["strong", "suppressed"], stand_in={11})) == [10]
+    assert select_controls(appraised(["suppressed"] * 5, fallback={12})) == [12]
+    assert select_controls(appraised(["strong", "suppressed"], fallback={11})) == [10]
     assert select_controls(appraised(["suppressed"])) == []

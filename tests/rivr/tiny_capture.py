@@ -134,7 +134,7 @@ def tried_rows(context: StageContext[Any]) -> list[Selection]:
 def tiny_rivr(**changes: Any) -> RivrConfig:
     """Return settings of two rounds of a few steps, within the margins of harm, with the paper's rules.
 
-    Raw frames stay as they are, there are three candidates, and every target frame gets a pseudo observation.
+    Frames stay as they are, there are three candidates, and every target frame gets a pseudo observation.
     """
     settings: dict[str, Any] = {
         "rounds": 2,
@@ -245,7 +245,7 @@ def rva_row(k: int) -> dict[str, Any]:
         "bin": 0,
         "role": ROLES[k],
         "weight": WEIGHTS[k],
-        "stand_in": False,
+        "fallback": False,
         "reactivated_for": None,
     }
     return {name: known.get(name, 0.0) for name in RVA_FRAMES.names}

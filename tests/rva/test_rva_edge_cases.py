@@ -26,12 +26,12 @@ def test_the_best_tenth_stands_in_when_no_frame_is_reliable() -> None:
     result = assess(
         ids(20), uniform_cues(R, [0.2] * 20), poses_at(along_x(range(20))), observations_of({}), CONFIG
     )
-    assert np.flatnonzero(result.stand_in).tolist() == [3, 7]
+    assert np.flatnonzero(result.fallback).tolist() == [3, 7]
     assert not result.reliable.any()
     assert "strong" not in result.role.tolist()
-    assert result.D[19] == pytest.approx(0.65 * 16 / 19)  # farthest stand-in: frame 3
+    assert result.D[19] == pytest.approx(0.65 * 16 / 19)  # farthest fallback: frame 3
     table = frames_table(ids(20), ["x"] * 20, "hand-1", uniform_cues(R, [0.2] * 20), result)
-    chosen = [row["frame_id"] for row in table.to_pylist() if row["reliable"] or row["stand_in"]]
+    chosen = [row["frame_id"] for row in table.to_pylist() if row["reliable"] or row["fallback"]]
     assert chosen == [3, 7]
 
 
@@ -108,7 +108,7 @@ def test_no_frame_is_scored() -> None:
     cues = np.full((2, 11), np.nan)
     result = assess(ids(2), cues, poses_at(along_x([0.0, 1.0])), observations_of({0: [1], 1: [1]}), CONFIG)
     assert result.weight.tolist() == [0.0, 0.0]
-    assert not result.stand_in.any()
+    assert not result.fallback.any()
 
 
 def test_no_frames() -> None:
@@ -122,7 +122,7 @@ def test_no_frame_is_registered() -> None:
     poses = poses_at(along_x([0.0, 1.0]), registered=[False, False])
     result = assess(ids(2), uniform_cues([0.9, 0.9], [0.1, 0.1]), poses, observations_of({}), CONFIG)
     assert result.role.tolist() == ["suppressed", "suppressed"]
-    assert not result.stand_in.any()
+    assert not result.fallback.any()
 
 
 def test_a_frame_without_points_has_neither_gain_nor_overlap() -> None:

@@ -128,7 +128,7 @@ def test_frames_without_pose_or_scores_have_no_effect(capture: Capture) -> None:
 @given(captures(), st.integers(0, 23), st.integers(0, 23))
 def test_a_point_shared_with_a_reliable_frame_raises_no_gain(capture: Capture, i: int, j: int) -> None:
     before = capture.assess()
-    reference = np.flatnonzero(before.reliable | before.stand_in)
+    reference = np.flatnonzero(before.reliable | before.fallback)
     placed = np.flatnonzero(before.bin >= 0)
     if not len(placed):
         return
@@ -146,4 +146,4 @@ def test_reliable_frames_are_strong_and_gain_no_coverage(capture: Capture) -> No
     result = capture.assess()
     np.testing.assert_array_equal(result.reliable, result.role == Role.STRONG)
     assert not result.C[result.reliable].any()
-    assert result.reliable.any() or result.stand_in.any() or not (result.bin >= 0).any()
+    assert result.reliable.any() or result.fallback.any() or not (result.bin >= 0).any()

@@ -113,7 +113,7 @@ def run(ingest_dir: Path, out: Path, config: RvaConfig, threads: int = 1) -> dic
 def test_tables_of_a_small_capture(ingest_dir: Path, tmp_path: Path) -> None:
     summary = run(ingest_dir, tmp_path / "rva", RvaConfig())
     table = read_table(tmp_path / "rva" / "frames.parquet", FRAMES)
-    assert table.column_names == [*DESIGN_COLUMNS, "stand_in", "reactivated_for"]
+    assert table.column_names == [*DESIGN_COLUMNS, "fallback", "reactivated_for"]
     rows = {row["frame_id"]: row for row in table.to_pylist()}
     assert sorted(rows) == [0, 1, 2, 3, 4, 5, 7]  # the held-out frame has no row
     assert rows[UNREGISTERED]["G"] is None

@@ -47,7 +47,7 @@ def test_scores(result: Assessment) -> None:
     assert result.R.tolist() == near(0.86, 0.2, 0.4, 0.1, 0.1)
     assert result.B.tolist() == near(0.125, 0.5, 0.6, 0.9, 0.9)
     assert result.reliable.tolist() == [True, False, False, False, False]  # A = {0}
-    assert not result.stand_in.any()
+    assert not result.fallback.any()
 
 
 def test_coverage_gain(result: Assessment) -> None:

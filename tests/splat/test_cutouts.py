@@ -16,6 +16,7 @@ from cleargs.progress import SilentReporter
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import run as run_training
 
 
 @pytest.mark.parametrize("exposed", [False, True])
@@ -39,7 +40,9 @@ def test_transparent_pixels_become_empty(tmp_path: Path, exposed: bool) -> None:
     )
     config = TrainConfig(steps=300, begin=0.0, end=1.0, budget=400)
     trainer = Trainer(start, views, config, seed=(0,), formation=formation)
-    made = trainer.run(checkpoint=tmp_path / "c.safetensors", reporter=SilentReporter()).scene.gaussians
+    made = run_training(
+        trainer, checkpoint=tmp_path / "c.safetensors", reporter=SilentReporter()
+    ).scene.gaussians
     outside, inside = [], []
     for view in views:
         target = engine.forward(truth, view.camera).alpha.clone()

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from cleargs.errors import InputError
+from cleargs.gpu import Machine
 from cleargs.manifest import KeyParts
-from cleargs.pipeline import session
 from cleargs.pipeline.keys import key_config, library_versions
+from cleargs.pipeline.session import resolve_device
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.kernels.cuda import support
 
@@ -28,10 +29,10 @@ def test_engine_refuses_a_gpu_that_is_not_there(monkeypatch: pytest.MonkeyPatch)
         rasteriser_for("meta")
 
 
-def test_the_command_line_names_the_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "cuda_obstacle", lambda: "there is no NVIDIA GPU")
+def test_the_command_line_names_the_obstacle() -> None:
+    machine = Machine(lambda: "there is no NVIDIA GPU")
     with pytest.raises(InputError, match="no NVIDIA GPU") as caught:
-        session.resolve_device("cuda", lambda line: None)
+        resolve_device("cuda", lambda line: None, machine=machine)
     assert "--device cpu" in caught.value.hint
 
 

@@ -85,7 +85,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
             rated.append(
                 dict.fromkeys(RVA_FRAMES.names, 0.5)
                 | {"frame_id": frame_id, "name": image, "evaluator": "toy-1", "bin": 0}
-                | {"reliable": frame_id in ACTIVE, "stand_in": False, "reactivated_for": None}
+                | {"reliable": frame_id in ACTIVE, "fallback": False, "reactivated_for": None}
                 | {"weight": ACTIVE.get(frame_id, 0.0), "b_ghosting": 0.0}
                 | {"role": "strong" if ACTIVE.get(frame_id, 0.0) > 0.8 else "suppressed"}
             )

@@ -15,7 +15,9 @@ from cleargs.progress import SilentReporter
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.schedule import TEXTURE_EVERY, TEXTURE_FROM, Schedule
 from cleargs.splat.texture import WEIGHTS, TextureLoss, crop_of
-from cleargs.splat.trainer import Trained, Trainer
+from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import Trained
+from cleargs.splat.training import run as run_training
 
 CONFIG = TrainConfig(steps=40, budget=80, checkpoint_interval=1, sh_every=0.25, lr_means=2e-3, texture=0.4)
 
@@ -38,7 +40,7 @@ def trained(folder: Path, config: TrainConfig = CONFIG, stop: int | None = None)
         state, trainer = trainer.state(), Trainer(start(sh_degree=1), seen, config, seed=(7,))
         assert trainer.matches(state)
         trainer.restore({name: tensor.clone() for name, tensor in state.items()})
-    return trainer.run(checkpoint=checkpoint, reporter=SilentReporter())
+    return run_training(trainer, checkpoint=checkpoint, reporter=SilentReporter())
 
 
 def parameters(result: Trained) -> dict[str, torch.Tensor]:

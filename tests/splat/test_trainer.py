@@ -19,20 +19,22 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.observed import render_observed
+from cleargs.formation.formed import render_formed
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.scene.measure import ViewPsnr, evaluate_views, pooled_unseen
-from cleargs.splat import trainer as trainer_module
+from cleargs.splat import training as training_module
 from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
-from cleargs.splat.formation import recorded
+from cleargs.splat.formation import clip_to_saturation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.trainer import Trained, Trainer
+from cleargs.splat.trainer import Trainer
+from cleargs.splat.training import Trained
+from cleargs.splat.training import run as run_training
 from cleargs.splat.types import Moments, Render
 from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
@@ -70,7 +72,7 @@ def run(pictures_or_views: Any, folder: Path, config: TrainConfig = CONFIG, **op
     arguments = {"scene": start(sh_degree=1), "seed": (7,), "reporter": SilentReporter()} | options
     scene, reporter, round = arguments.pop("scene"), arguments.pop("reporter"), arguments.pop("round", 0)
     trainer = Trainer(scene, made, config, **arguments)
-    return trainer.run(checkpoint=folder / "state.safetensors", reporter=reporter, round=round)
+    return run_training(trainer, checkpoint=folder / "state.safetensors", reporter=reporter, round=round)
 
 
 def affines(weights: list[float] | None = None, rate: float = CONFIG.lr_exposure) -> CaptureFormation:
@@ -151,7 +153,7 @@ def test_saturated_pixels_do_not_darken_the_scene(pictures: list[np.ndarray], tm
 def test_a_saturated_channel_bounds_the_render_from_below() -> None:
     target = torch.tensor([[[1.0, 1.0, 0.5], [254 / 255, 0.9, 0.0]]])
     image = torch.tensor([[[1.3, 0.8, 0.7], [1.1, 1.2, 0.1]]])
-    image_recorded, clipped = recorded(image, target)
+    image_recorded, clipped = clip_to_saturation(image, target)
     assert clipped.tolist() == [[[True, False, False], [True, False, False]]]
     assert torch.equal(image_recorded, torch.where(clipped, target, image))
 
@@ -584,8 +586,8 @@ def test_slow_checkpoints_become_rare(
         clock[0] += 1.0
         saved.append(int(state["step"]))
 
-    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(trainer_module, "save_state", slow_save)
+    monkeypatch.setattr(training_module.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(training_module, "save_state", slow_save)
     monkeypatch.setattr(Trainer, "step", slow_step)
     run(pictures, tmp_path, CONFIG.model_copy(update={"steps": 100, "checkpoint_interval": 10}))
     assert saved == [10, 50, 90]
@@ -640,5 +642,5 @@ def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: P
     grey = [float((exposure.of(frame) @ [0.5, 0.5, 0.5, 1.0]).mean()) for frame in range(6)]
     # The true ratio of the halves is 0.8. The test asserts half of the way; noise would give about 1.
     assert np.mean(grey[3:]) / np.mean(grey[:3]) < 0.9
-    bright, dark = (render_observed(trained.scene, views(darker)[i], exposure) for i in (0, 3))
+    bright, dark = (render_formed(trained.scene, views(darker)[i], exposure) for i in (0, 3))
     assert bright.mean() > dark.mean()

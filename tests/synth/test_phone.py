@@ -17,7 +17,7 @@ from cleargs.synth.image_motion import track_motion
 from cleargs.synth.movers import Balloon
 from cleargs.synth.optics import Shutter
 from cleargs.synth.path import FPS, HandheldPath, frame_times
-from cleargs.synth.phone import LAG_S, METERING_SHARE, Look, auto_exposure, encode_and_decode, phone_look
+from cleargs.synth.phone import LAG_S, METERING_SHARE, Tone, auto_exposure, encode_and_decode, tone_of
 from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, plan_faults
 from cleargs.synth.raycast import RoomWorld, room_setup
 from cleargs.synth.room import make_room
@@ -46,18 +46,18 @@ def phone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_tone_curve_rises_from_black_to_white() -> None:
     values = np.linspace(0, 1, 257)
     for seed in range(5):
-        curve = phone_look(seed).tone(values)
+        curve = tone_of(seed).tone(values)
         assert (np.diff(curve) > 0).all()
         assert curve[0] == pytest.approx(0, abs=1e-12) and curve[-1] == pytest.approx(1)
         # The curve differs from sRGB by much more than rounding to 8 bits.
         assert np.abs(curve - values).max() > 0.03
-    np.testing.assert_array_equal(Look().tone(values), values)
+    np.testing.assert_array_equal(Tone().tone(values), values)
 
 
 def test_sharpening_overshoots_at_edges_only() -> None:
     image = np.full((20, 40, 3), 0.4)
     image[:, 20:] = 0.6
-    sharpened = Look(sharpening=0.5).apply(image)
+    sharpened = Tone(sharpening=0.5).apply(image)
     assert sharpened[10, 19, 1] < 0.38 and sharpened[10, 20, 1] > 0.62
     np.testing.assert_allclose(sharpened[:, [0, -1]], image[:, [0, -1]], atol=1e-12)
 
@@ -95,10 +95,10 @@ def test_the_video_shows_the_frames_with_codec_artifacts(tmp_path: Path) -> None
 
 def test_the_true_faults_of_every_frame_are_written(phone: Path) -> None:
     rows = pq.read_table(phone / "truth" / "frames.parquet").to_pylist()
-    look = phone_look(SEED)
+    tone = tone_of(SEED)
     for row in rows:
-        assert (row["tone_contrast"], row["tone_pivot"]) == (look.contrast, look.pivot)
-        assert row["sharpening"] == look.sharpening > 0
+        assert (row["tone_contrast"], row["tone_pivot"]) == (tone.contrast, tone.pivot)
+        assert row["sharpening"] == tone.sharpening > 0
         assert row["codec_bits_per_pixel"] > 0 and row["noise"] > 0 and row["readout_s"] > 0
         assert row["shutter_share"] == pytest.approx(row["exposure_s"] * FPS)
         assert row["shutter_share"] == pytest.approx(PROTOCOLS["phone"].shutter)

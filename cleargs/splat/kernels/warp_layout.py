@@ -25,7 +25,7 @@ READ_STEPS = 3
 nearness at its end. The number is odd: where a pixel sees what the still image hides, the nearness alternates
 between that in front and that behind, and from the one in front the pixel gets the colour behind."""
 
-# A frame's motion as the kernels read it: a row of float32, lengths in pixels of the observed image.
+# A frame's motion as the kernels read it: a row of float32, lengths in pixels of the formed image.
 FX = 0
 FY = 1
 CX = 2
@@ -46,7 +46,7 @@ CUBE_REACH = 1.0 / 20.0
 
 
 class DisplacementFields(NamedTuple):
-    """Displacements of an observed image's pixels in px, x before y; ``frame_warp`` has the formula."""
+    """Displacements of a formed image's pixels in px, x before y; ``frame_warp`` has the formula."""
 
     offset: Tensor  # [2, H, W] mean over the exposure
     sweep: Tensor  # [2, H, W] over the exposure, by the part of the path that is linear in time

@@ -15,7 +15,7 @@ from cleargs.splat.views import TrainingView
 
 
 class Vignette:
-    """A `cleargs.splat.formation.Formation`: the observed image is (1 - strength r²) times the render."""
+    """A `cleargs.splat.formation.Formation`: the formed image is (1 - strength r²) times the render."""
 
     def __init__(self, strength: float = 0.0, rate: float = 0.05) -> None:
         self.strength, self.rate = strength, rate
@@ -25,7 +25,7 @@ class Vignette:
         view: TrainingView,
         factor: float,
         progress: float,
-        target: Tensor,
+        observed: Tensor,
         mask: Tensor | None,
         render: Renderer,
     ) -> "VignettedView":

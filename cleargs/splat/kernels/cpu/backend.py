@@ -244,7 +244,7 @@ def flow(basis: ArrayF32, twist: npt.NDArray[np.float64]) -> ArrayF32:
     return out
 
 
-def misfit(
+def residual(
     image: ArrayF32,  # [H, W]
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
@@ -252,13 +252,13 @@ def misfit(
     samples: ArrayF32,  # [K, 3]
     limit: float,
 ) -> float:
-    """Return the sum over all rows of `frame_search.misfits`.
+    """Return the sum over all rows of `frame_search.residuals`.
 
     ``fields`` are offset, sweep, radius and curve in px.
     """
     rows = np.empty(len(image))
     with LAUNCHING:
-        frame_search.misfits(image, observed, weight, *fields, samples, limit, rows)
+        frame_search.residuals(image, observed, weight, *fields, samples, limit, rows)
     return math.fsum(rows)
 
 
@@ -356,7 +356,7 @@ def _warm_up_formation() -> None:
         light = expose(colours, fields, torch.zeros(1, 3), margin=0)
         expose_backward(light, fields, torch.zeros(1, 3), margin=0)
         offset, sweep, radius, curve = _arrays(fields)
-        misfit(pixels, pixels, pixels, (offset, sweep, radius, curve), np.zeros((1, 3), np.float32), 1.0)
+        residual(pixels, pixels, pixels, (offset, sweep, radius, curve), np.zeros((1, 3), np.float32), 1.0)
         normal_equations(
             *(pixels, pixels, pixels, pixels),
             *(np.zeros((6, 2, SIZE, SIZE), np.float32), np.zeros(SIZE, np.float32), offset, sweep),

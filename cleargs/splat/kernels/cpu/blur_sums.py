@@ -1,6 +1,6 @@
-"""Sums for a least-squares fit of a photograph by the derivatives of a render.
+"""Sums for a least-squares fit of a frame image by the derivatives of a render.
 
-For a small blur whose covariance is S, a photograph is
+For a small blur whose covariance is S, a frame image is
 
     offset + gain * render + shift . grad(render) + tr(S H(render)) / 2
 
@@ -16,7 +16,7 @@ from cleargs.splat.kernels.cpu.jit import kernel
 from cleargs.types import AnyArray, ArrayF32
 
 TERMS = 8
-"""The regressors 1, R, R_x, R_y, R_xx / 2, R_xy, R_yy / 2, and the photograph."""
+"""The regressors 1, R, R_x, R_y, R_xx / 2, R_xy, R_yy / 2, and the frame image."""
 
 _DARK = np.float32(0.02)  # linear light below which the noise no longer decreases with the light
 _HALF = np.float32(0.5)
@@ -34,7 +34,7 @@ def blur_sums(
 ) -> None:
     """Write the products of the regressors, summed per row over the tiles of each colour of a checkerboard.
 
-    The weight of a pixel is divided by its squared light: after the sRGB curve, the noise of a photograph is
+    The weight of a pixel is divided by its squared light: after the sRGB curve, the noise of a frame image is
     about proportional to its light.
     """
     _, width = render.shape

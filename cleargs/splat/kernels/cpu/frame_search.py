@@ -1,4 +1,4 @@
-"""Kernels of the search for a frame's motion: its misfit (sum of differences), and a Gauss-Newton step.
+"""Kernels of the search for a frame's motion: its residual (sum of differences), and a Gauss-Newton step.
 
 Images have one channel and no margin. ``frame_warp`` has the formula of the fields.
 """
@@ -43,7 +43,7 @@ def flow(
 
 
 @kernel
-def misfits(
+def residuals(
     image: ArrayF32,  # [H, W]
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]

@@ -1,13 +1,13 @@
 """Warp a sharp image as a moving camera records it: blur, rolling shutter and defocus in one operation.
 
-A pixel x of the observed image is the mean of the sharp image at
+A pixel x of the formed image is the mean of the sharp image at
 
     x + offset(x) + t sweep(x) + (t^2 - 1/12) bend(x) + (t^3 - 3t/20) cube(x) + radius(x) (u, v)
 
 over ``samples`` (t, u, v): times t from -1/2 to 1/2 of the exposure, and points (u, v) of the unit disc. The
 polynomials are orthogonal over the exposure. ``curve`` [4, H, W] holds bend and cube. It is None for straight
 paths; Numba then compiles the kernels without these terms. Fields are in pixels, [2, H, W] with x before y.
-The sharp image is larger than the observed image by ``margin`` pixels on every side. Beyond its border, the
+The sharp image is larger than the formed image by ``margin`` pixels on every side. Beyond its border, the
 border pixels are repeated.
 
 Interpolation between pixels is linear. With a single sample (a rolling shutter without blur) it is cubic,
@@ -45,7 +45,7 @@ from cleargs.splat.kernels.warp_layout import CHANNELS
 from cleargs.types import AnyArray, ArrayF32
 
 BAND = 32
-"""Rows of the observed image per work item of the transpose."""
+"""Rows of the formed image per work item of the transpose."""
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _HALF = np.float32(0.5)

@@ -1,6 +1,6 @@
 """Blur, rolling shutter and defocus as one warp, and its transpose.
 
-The mathematics is that of the CPU back end's ``frame_warp``. A lane is a pixel of the observed image, in both
+The mathematics is that of the CPU back end's ``frame_warp``. A lane is a pixel of the formed image, in both
 directions. In the transpose, each pixel adds its light to the pixels that it sampled. Many pixels add to the
 same one, in no fixed order. Light is therefore added in integer multiples of a small unit: the sum does not
 depend on the order, and the transpose gives the same bits each time.

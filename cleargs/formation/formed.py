@@ -1,4 +1,4 @@
-"""The observed image of a frame (its render after image formation) and its gradient."""
+"""The formed image of a frame (its render after image formation) and its gradient."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class FormedView:
     """Implementation of `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
     A rolling shutter is a part of the camera: each Gaussian is seen from the pose at which its row was read.
-    With ``still``, the render is that of a still camera, and `warp` has the skew too, to undo it.
+    With ``global_shutter``, the render is that of a global shutter, and `warp` has the skew too, to undo it.
 
-    ``look`` receives each observed image with its render and margin, and returns the pixels that count: see
+    ``check`` receives each formed image with its render and margin, and returns the pixels that count: see
     `cleargs.formation.movement`.
     """
 
@@ -41,25 +41,25 @@ class FormedView:
     formation: FrameFormation | None = None
     factor: float = 1.0
     mask: Tensor | None = None
-    look: Callable[[Tensor, Render, int], Tensor | None] | None = None
-    still: bool = False
+    check: Callable[[Tensor, Render, int], Tensor | None] | None = None
+    global_shutter: bool = False
 
     def __post_init__(self) -> None:
         """Widen the camera by the margin that the formation needs, and let its shutter roll."""
         self._frame_camera = self.camera
         self._margin = 0
         self._motion = None if self.formation is None else self.formation.motion
-        if self._motion is not None and self._motion.skew.any() and not self.still:
+        if self._motion is not None and self._motion.skew.any() and not self.global_shutter:
             readout = readout_of(self._motion, self._frame_camera, self.factor)
             self.camera = replace(self.camera, readout=readout)
             self._motion = self._motion.exposed_only()
         if self.formation is not None and self._motion is not None:
-            self._margin = margin_for(self.formation.reach_px * self.factor, self._frame_camera)
+            self._margin = margin_for(self.formation.displacement_px * self.factor, self._frame_camera)
             self.camera = widened(self.camera, self._margin)
-        self.needs_depth = self._motion is not None or self.look is not None
+        self.needs_depth = self._motion is not None or self.check is not None
 
     def forward(self, render: Render) -> Tensor:
-        """Return the observed image [H, W, 3] sRGB of a render at ``camera``."""
+        """Return the formed image [H, W, 3] sRGB of a render at ``camera``."""
         image, device = render.image, render.image.device
         backend = backend_for(device)
         if self.affine is not None:
@@ -69,8 +69,8 @@ class FormedView:
             self._warp = self.warp(render)
             linear, self._to_linear = backend.through_curve(image, linear_curve(device), CHANNELS)
             image, self._to_srgb = backend.through_curve(self._warp.forward(linear), srgb_curve(device), 3)
-        if self.look is not None:
-            self.mask = self.look(image, render, self._margin)
+        if self.check is not None:
+            self.mask = self.check(image, render, self._margin)
         return image
 
     def warp(self, render: Render) -> Warp:
@@ -82,7 +82,7 @@ class FormedView:
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Return the gradient by the render's image, from that by the observed image."""
+        """Return the gradient by the render's image, from that by the formed image."""
         backend = backend_for(gradient.device)
         if self._motion is not None:
             light = backend.times_slope(gradient, self._to_srgb, CHANNELS)
@@ -97,7 +97,7 @@ class FormedView:
             self.affines.step(self.frame_id, self._affine_gradient.cpu().numpy())
 
 
-def render_observed(
+def render_formed(
     scene: Scene,
     view: TrainingView,
     exposure: Exposure | None = None,

@@ -1,7 +1,8 @@
 """Estimation of a frame's formation with a scene.
 
-The *misfit* of a frame is its mean difference from the render (`comparison`). *Evidence* is the share of the
-squared error that further blur would explain (`pretest`). A *search* fits all models from scratch (`search`).
+The *residual* of a frame is its mean difference from the render (`comparison`). The *gain* of a missing
+blur is the share of the squared error that it would explain (`pretest`). A *search* fits all models from
+scratch (`search`).
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ import torch
 from torch import Tensor
 
 from cleargs.formation.comparison import (
-    MIN_MISFIT,
+    MIN_RESIDUAL,
     FramePair,
     MotionFit,
     explained_share,
     finest_level,
     luminance,
 )
-from cleargs.formation.frame import FrameFormation, margin_for, reach_of
+from cleargs.formation.frame import FrameFormation, displacement_of, margin_for
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.motion import FrameMotion, Model, widened
-from cleargs.formation.pretest import BlurEvidence, blur_evidence
+from cleargs.formation.pretest import MissingBlur, missing_blur
 from cleargs.formation.search import blur_along, corrected, measured_fits, named, preferred, refine, search
 from cleargs.formation.warp import Warp, displacement_fields, path_lengths
 from cleargs.splat.backend import backend_for
@@ -36,15 +37,15 @@ from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
 from cleargs.splat.types import Render
 from cleargs.types import ArrayF64
 
-EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
-"""Evidence of blur above which a frame is searched. The second value is for frames that RVA doubts. Both are
-from tuning captures (docs/experiments/formation.md)."""
-WORSE = -0.03
-"""Threshold of a check before a frame without a model is searched in a sharp capture: half of the blur that
-the test found must not raise the misfit by 3 % or more. Wrong geometry can look like blur in the test, but
-blurring the render then makes it less like the frame (docs/experiments/formation.md)."""
-GROWN_EVIDENCE = 1.25
-"""Factor by which the evidence must have grown since the last search before a frame is searched again."""
+SEARCH_GAIN, LOW_WEIGHT_GAIN = 0.015, 0.005
+"""Gain of a missing blur above which a frame is searched. The second value is for frames with a low weight by
+RVA. Both are from tuning captures (docs/experiments/formation.md)."""
+MAX_RISE = 0.03
+"""Limit of a check before a frame without a model is searched in a sharp capture: half of the blur that the
+test found must not raise the residual by this share or more. Wrong geometry can look like blur in the test,
+but blurring the render then makes it less like the frame (docs/experiments/formation.md)."""
+GROWN_GAIN = 1.25
+"""Factor by which the gain must have grown since the last search before a frame is searched again."""
 SEARCHED_SHARE = 0.05
 """Margin of a search, as a share of the longer side."""
 
@@ -61,12 +62,12 @@ softness of the render: sharp frames of rooms found 0.2 to 0.8 px, and the scene
 
 @dataclass(frozen=True)
 class Shot:
-    """A raw frame at the size of a training step, and the scene that it shows."""
+    """A frame image at the size of a training step, and the scene that it shows."""
 
     camera: Camera
     """The camera of the frame, reduced by ``factor``."""
     affine: Tensor | None  # [3, 4] colour of the frame
-    target: Tensor  # [H, W, 3] sRGB
+    observed: Tensor  # [H, W, 3] sRGB
     mask: Tensor | None  # [H, W]
     render: Renderer
     """Renders the scene with depth."""
@@ -76,18 +77,18 @@ class Shot:
 
 @dataclass(frozen=True)
 class Terms:
-    """Facts about a frame and its capture on which a look depends."""
+    """Facts about a frame and its capture on which an estimate depends."""
 
     pose: bool = False
     """Correct the pose together with a motion."""
-    doubted: bool = False
-    """RVA doubts the frame, so less evidence is needed for a search."""
-    shutter: Literal["still", "tested", "rolls"] = "still"
-    """still: no model with a skew; tested: none, but `FrameFormation.skew_gain` is measured; rolls: all."""
+    low_weight: bool = False
+    """RVA gives the frame a low weight, so less blur is enough for a search."""
+    shutter: Literal["global", "tested", "rolling"] = "global"
+    """global: no model has a skew; tested: none, but the `FrameFormation.skew_gain` is measured."""
     curve: bool = False
     """Try a higher order of the path, and search a frame with a curved path or a rolling shutter."""
-    sparing: bool = False
-    """Also the first time, search only for a blur that the test and `_Look._resembles` admit."""
+    only_if_blur_found: bool = False
+    """Skip the first search unless the test finds a blur that `_Estimate._resembles` admits."""
     exposure_s: float = 0.0
     """Exposure time of the frames around this one, s; 0: it is not known."""
     measured: MeasuredPath | None = None
@@ -110,38 +111,38 @@ def fit_motion(
     shot: Shot,
     terms: Terms,
 ) -> FrameFormation:
-    """Estimate how a raw frame was taken, from the scene that it shows.
+    """Estimate how a frame image was taken, from the scene that it shows.
 
     The known formation is refined, or the measured motion is followed. The frame is searched only for a
     `Reason`.
     """
-    look = _Look(frame, config, shot, terms)
-    found = look.followed()
-    best = look.accepted(found[1:] or found, found[0])
-    evidence = look.unexplained(best)
-    if look.reason(found, best, evidence) is None:
-        return look.described(best, min(frame.evidence, evidence.gain))
-    found = look.searched(found, best, evidence)
-    best = look.accepted(found, found[0])
-    return look.described(best, look.unexplained(best).gain)
+    estimate = _Estimate(frame, config, shot, terms)
+    found = estimate.followed()
+    best = estimate.accepted(found[1:] or found, found[0])
+    missing = estimate.unexplained(best)
+    if estimate.reason(found, best, missing) is None:
+        return estimate.described(best, min(frame.blur_gain, missing.gain))
+    found = estimate.searched(found, best, missing)
+    best = estimate.accepted(found, found[0])
+    return estimate.described(best, estimate.unexplained(best).gain)
 
 
-class _Look:
-    """One look at a frame, with the present scene."""
+class _Estimate:
+    """One estimate of a frame's formation, with the present scene."""
 
     def __init__(self, frame: FrameFormation, config: FormationConfig, shot: Shot, terms: Terms) -> None:
         self._frame, self._config, self._shot, self._terms = frame, config, shot, terms
-        self._show(margin_for(frame.reach_px * shot.factor, shot.camera))
+        self._show(margin_for(frame.displacement_px * shot.factor, shot.camera))
 
     def _show(self, margin: int) -> None:
         """Render the scene with a margin."""
         shot, self._margin = self._shot, margin
         self._rendered = shot.render(widened(shot.camera, margin))
-        self._pair = frame_pair(self._rendered, shot.affine, shot.target, shot.mask, shot.camera, margin)
+        self._pair = frame_pair(self._rendered, shot.affine, shot.observed, shot.mask, shot.camera, margin)
 
     @property
     def _known(self) -> FrameMotion:
-        """The known motion, at the size of this look."""
+        """The known motion, at the size of this estimate."""
         return _scaled(self._frame.motion, self._shot.factor)
 
     @property
@@ -182,7 +183,7 @@ class _Look:
             found.append(self._corrected(measured, path))
         if self._terms.exposure_s > 0.0:
             found += self._best_of(measured, np.array([self._terms.exposure_s]))
-        if self._frame.draws == 0 or self._terms.curve:
+        if self._frame.steps == 0 or self._terms.curve:
             coarse = self._best_of(measured, EXPOSURES * measured.frame_s)[0].motion.exposure_s
             found += self._best_of(measured, NEARER * coarse)
         return found
@@ -190,7 +191,7 @@ class _Look:
     def _best_of(self, measured: MeasuredPath, times: ArrayF64) -> list[MotionFit]:
         """Return fits of the measured motion during the exposure of ``times`` that explains most."""
         fits = measured_fits(self._pair, [self._exposed(measured, float(time)) for time in times])
-        return [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.misfit).motion)]
+        return [*fits, self._corrected(measured, min(fits, key=lambda fit: fit.residual).motion)]
 
     def _visible(self, fit: MotionFit) -> bool:
         """Return True if the mean blur of ``fit`` is not shorter than `SHORTEST`."""
@@ -203,68 +204,68 @@ class _Look:
         known = measured.measurement(path.exposure_s, self._shot.camera, path.median_depth)
         return corrected(self._pair, path, known, pose=self._terms.pose)
 
-    def accepted(self, found: list[MotionFit], still: MotionFit) -> MotionFit:
-        """Return the best of ``found`` that explains enough more than ``still``, else ``still``.
+    def accepted(self, found: list[MotionFit], without: MotionFit) -> MotionFit:
+        """Return the best of ``found`` that explains enough more than ``without``, else ``without``.
 
         The model that the frame had needs only half as much, and so does a measured motion. A measured motion
         during the exposure time of the frames around it must only explain no less.
         """
         best = preferred(found)
-        if best.model == still.model:
-            return min(best, still, key=lambda fit: fit.misfit)
+        if best.model == without.model:
+            return min(best, without, key=lambda fit: fit.residual)
         known = best.model == self._frame.model or best.motion.exposure_s > 0.0
-        gain = explained_share(best.misfit, still.misfit)
+        gain = explained_share(best.residual, without.residual)
         if gain >= self._config.accept * (0.5 if known else 1.0):
             return best
         alike = [fit for fit in found if 0.0 < fit.motion.exposure_s == self._terms.exposure_s]
-        exposed = min(alike, key=lambda fit: fit.misfit, default=still)
-        return exposed if exposed.misfit <= still.misfit else still
+        exposed = min(alike, key=lambda fit: fit.residual, default=without)
+        return exposed if exposed.residual <= without.residual else without
 
-    def unexplained(self, fit: MotionFit) -> BlurEvidence:
+    def unexplained(self, fit: MotionFit) -> MissingBlur:
         """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
         return _unexplained(self._pair, self._rendered, fit)
 
-    def reason(self, found: list[MotionFit], best: MotionFit, evidence: BlurEvidence) -> Reason | None:
+    def reason(self, found: list[MotionFit], best: MotionFit, missing: MissingBlur) -> Reason | None:
         """Return the reason to search the frame; None if there is none."""
-        frame, terms, rolls = self._frame, self._terms, self._terms.shutter == "rolls"
+        frame, terms, rolls = self._frame, self._terms, self._terms.shutter == "rolling"
         if terms.measured is None:
             # A formation that was found under the other assumption about the shutter is searched again.
             unmeasured = frame.skew_gain is None or frame.skew_gain > self._config.accept
             if terms.shutter == "tested" or (rolls and unmeasured and _admitted(frame.model, rolling=False)):
                 return Reason.SHUTTER
-            if frame.draws == 0 and not terms.sparing:
+            if frame.steps == 0 and not terms.only_if_blur_found:
                 return Reason.FIRST
             if not _admitted(frame.model, rolls):
                 return Reason.MODEL
             if terms.curve and (rolls or preferred(found[1:] or found).motion.order > 1):
                 return Reason.CURVE
-        enough = max(DOUBTED_EVIDENCE if terms.doubted else EVIDENCE, GROWN_EVIDENCE * frame.evidence)
-        blurred = evidence.gain > enough and best.misfit > MIN_MISFIT
+        enough = max(LOW_WEIGHT_GAIN if terms.low_weight else SEARCH_GAIN, GROWN_GAIN * frame.blur_gain)
+        blurred = missing.gain > enough and best.residual > MIN_RESIDUAL
         known = best.model not in ("none", "skew")
-        if blurred and (known or not terms.sparing or self._resembles(evidence)):
+        if blurred and (known or not terms.only_if_blur_found or self._resembles(missing)):
             return Reason.BLUR
         return None
 
-    def _resembles(self, evidence: BlurEvidence) -> bool:
-        """Return True unless half of the blur that the test found raises the misfit too much (`WORSE`)."""
+    def _resembles(self, missing: MissingBlur) -> bool:
+        """Return True unless half of the missing blur raises the residual too much (`MAX_RISE`)."""
         level = finest_level(self._pair)
-        blur = replace(blur_along(0.5 * evidence.length, evidence.angle), median_depth=level.median)
-        return level.evaluate("blur", blur).explained > WORSE
+        blur = replace(blur_along(0.5 * missing.length, missing.angle), median_depth=level.median)
+        return level.evaluate("blur", blur).explained > -MAX_RISE
 
-    def searched(self, followed: list[MotionFit], best: MotionFit, evidence: BlurEvidence) -> list[MotionFit]:
+    def searched(self, followed: list[MotionFit], best: MotionFit, missing: MissingBlur) -> list[MotionFit]:
         """Return the fits of a search, the one without blur first, with that of the followed motion."""
         camera, terms = self._shot.camera, self._terms
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
         if wide > self._margin:
             self._show(wide)
         resting = self._resting() if self._held is not None else followed[0]
-        whole = evidence if best.model == resting.model else self.unexplained(resting)
-        skews = terms.shutter != "still" and terms.measured is None
+        whole = missing if best.model == resting.model else self.unexplained(resting)
+        skews = terms.shutter != "global" and terms.measured is None
         found = search(
             self._pair,
             start=None if skews else blur_along(whole.length, whole.angle),
             skew=skews,
-            defocus=terms.shutter == "rolls" or whole.disc_gain > whole.line_gain,
+            defocus=terms.shutter == "rolling" or whole.disc_gain > whole.line_gain,
             pose=terms.pose,
             held=self._held,
         )
@@ -277,12 +278,12 @@ class _Look:
                 found.append(finest_level(self._pair).evaluate(model, motion))
             else:
                 found += refine(self._pair, model, motion, pose=terms.pose)[1:]
-        rolls = terms.shutter == "rolls" or self._held is not None
+        rolls = terms.shutter == "rolling" or self._held is not None
         return [fit for fit in found if _admitted(fit.model, rolls)]
 
-    def described(self, best: MotionFit, evidence: float) -> FrameFormation:
-        """Return the frame with its new fit and the evidence of further blur."""
-        frame, shot = replace(self._frame, evidence=evidence), self._shot
+    def described(self, best: MotionFit, gain: float) -> FrameFormation:
+        """Return the frame with its new fit and the gain of a missing blur."""
+        frame, shot = replace(self._frame, blur_gain=gain), self._shot
         return _described(frame, best, shot.factor, shot.camera, self._rendered, self._margin)
 
 
@@ -293,7 +294,7 @@ def _blur_of(motion: FrameMotion, pair: FramePair, rendered: Render) -> float:
     return float(path_lengths(fields, 4).mean(dtype=np.float64))
 
 
-def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvidence:
+def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> MissingBlur:
     """Return the blur of the frame that is missing in the render after the image formation of ``fit``."""
     shown = pair.luminance
     if fit.model != "none":
@@ -304,7 +305,7 @@ def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvide
         shown = exposed[..., 0].cpu().numpy()
     elif pair.margin:
         shown = shown[pair.margin : -pair.margin, pair.margin : -pair.margin]
-    return blur_evidence(np.ascontiguousarray(shown), pair.observed, pair.weight)
+    return missing_blur(np.ascontiguousarray(shown), pair.observed, pair.weight)
 
 
 def _admitted(model: Model, rolling: bool) -> bool:
@@ -312,21 +313,26 @@ def _admitted(model: Model, rolling: bool) -> bool:
 
 
 def _skew_gain(found: list[MotionFit]) -> float:
-    """Return the share by which the best model with a skew reduces the misfit of the best one without."""
-    still = preferred([e for e in found if _admitted(e.model, rolling=False)])
+    """Return the share by which the best model with a skew reduces the residual of the best one without."""
+    without = preferred([e for e in found if _admitted(e.model, rolling=False)])
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
-    return max(0.0, explained_share(rolled.misfit, still.misfit))
+    return max(0.0, explained_share(rolled.residual, without.residual))
 
 
 def frame_pair(
-    rendered: Render, affine: Tensor | None, target: Tensor, mask: Tensor | None, camera: Camera, margin: int
+    rendered: Render,
+    affine: Tensor | None,
+    observed: Tensor,
+    mask: Tensor | None,
+    camera: Camera,
+    margin: int,
 ) -> FramePair:
     """Return the images that a search compares. Masked pixels of the frame show the render."""
     assert rendered.depth is not None
     image = rendered.image
     if affine is not None:
         image = backend_for(image.device).apply_affine(image, affine)
-    shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
+    shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), observed.cpu().numpy()
     counts = np.ones(seen.shape[:2], np.bool_) if mask is None else mask.cpu().numpy()
     inner = shown[margin : margin + camera.height, margin : margin + camera.width]
     return FramePair(
@@ -348,11 +354,11 @@ def _described(
         return FrameFormation(
             frame.frame_id,
             FrameMotion(median_depth=best.motion.median_depth),
-            misfit=best.misfit,
-            misfit_still=best.misfit_still,
+            residual=best.residual,
+            residual_without=best.residual_without,
             skew_gain=frame.skew_gain,
-            evidence=frame.evidence,
-            draws=frame.draws,
+            blur_gain=frame.blur_gain,
+            steps=frame.steps,
         )
     motion = _scaled(best.motion, 1.0 / factor)
     depth, alpha = rendered.depth, rendered.alpha
@@ -366,12 +372,12 @@ def _described(
         frame,
         motion=motion,
         model=best.model,
-        misfit=best.misfit,
-        misfit_still=best.misfit_still,
+        residual=best.residual,
+        residual_without=best.residual_without,
         blur_px=float(path_lengths(whole).mean(dtype=np.float64)) / factor,
         skew_px=float(path_lengths(turned).mean(dtype=np.float64)) / factor,
         defocus_px=float(whole.radius.cpu().numpy().mean(dtype=np.float64)) / factor,
-        reach_px=reach_of(whole) / factor,
+        displacement_px=displacement_of(whole) / factor,
     )
 
 
