@@ -41,7 +41,7 @@ VERSION = 53
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
-    "ingest": ("frames.parquet", "motion.parquet", "images", "masks"),
+    "ingest": ("frames.parquet", "motion.parquet", "images", "masks", "movers.parquet"),
     "rva": ("frames.parquet",),
     "g0": TRAINED,
     "rivr": (*TRAINED, "selection.parquet", *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1))),

@@ -21,6 +21,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
         "motion.parquet",
         "images",
         "masks",
+        "movers.parquet",
     ),
     "rva": ("frames.parquet",),
 }
@@ -71,7 +72,8 @@ def run(context: StageContext[G0Config]) -> StageResult:
     config, ingest = context.config, context.inputs["ingest"]
     set_threads(context.threads)
     allocation = read_table(context.inputs["rva"] / "frames.parquet", RVA_FRAMES).to_pylist()
-    views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
+    frames = load_frames(ingest)
+    views = real_views(frames, {row["frame_id"]: row["weight"] for row in allocation}, ingest)
     require_views(views)
     sparse = seen_points(load_points(ingest), ingest, views)
 
@@ -90,12 +92,13 @@ def run(context: StageContext[G0Config]) -> StageResult:
     alike = exposure_spread <= config.exposure_threshold and colour_spread <= config.colour_threshold
     off = config.exposure == "off" or (config.exposure == "auto" and alike)
     exposure = None if off else Exposure.from_gains([view.frame_id for view in views], gains)
+    looks = movement_expected(config, allocation, [frame.movers for frame in frames])
     formation = CaptureFormation(
         views,
         config.formation,
         exposure=exposure,
         lr_exposure=config.lr_exposure,
-        tolerance=TOLERANCE if movement_expected(config, allocation) else 0.0,
+        tolerance=TOLERANCE if looks else 0.0,
         measured=load_paths(ingest),
     )
     trained, dropped, few, fits = train_into(
@@ -132,9 +135,17 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
 
 
-def movement_expected(config: G0Config, allocation: Sequence[Mapping[str, Any]]) -> bool:
-    """Return True if the training must look for movement; ``allocation`` are RVA's rows of the frames."""
+def movement_expected(
+    config: G0Config, allocation: Sequence[Mapping[str, Any]], movers: Sequence[Sequence[object] | None]
+) -> bool:
+    """Return True if the training must look for movement.
+
+    ``allocation`` are RVA's rows of the frames, ``movers`` what is seen in them that may move (None: it was
+    not looked for).
+    """
     from cleargs.formation.movement import HIDING
 
     asked = config.formation.movement
+    if asked == "auto" and any(boxes is not None for boxes in movers):
+        return any(movers)
     return asked == "on" or (asked == "auto" and any(row["b_ghosting"] >= HIDING for row in allocation))

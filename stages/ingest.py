@@ -15,6 +15,7 @@ from cleargs.capture.config import CaptureConfig, SfmConfig
 from cleargs.capture.sources import externals as capture_externals
 from cleargs.files import External
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.types import Device
 
 
 class IngestConfig(SfmConfig, CaptureConfig):
@@ -77,11 +78,26 @@ _FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 1.3, 0.2
 
 def externals(config: IngestConfig, source: Path) -> Mapping[str, External]:
     """Return the files and folders of the capture that are read."""
-    return capture_externals(source, config)
+    from cleargs.models.registry import installed_files
+
+    return {**capture_externals(source, config), **installed_files("people")}
+
+
+def other_libraries(device: Device, config: object) -> Mapping[str, str]:
+    """Return the version of torch if it evaluates the detector of people."""
+    from cleargs.models.registry import installed_files
+
+    return {"torch": metadata.version("torch")} if installed_files("people") else {}
 
 
 def preflight(config: IngestConfig) -> None:
-    """Do nothing: ingest needs no model."""
+    """Raise InputError if the detector of people is installed, but damaged. Ingest needs no model."""
+    from cleargs.models.registry import installed_files
+
+    if installed_files("people"):
+        from cleargs.models.detector import load_detector
+
+        load_detector()
 
 
 def estimate(context: StageContext[IngestConfig]) -> Estimate:
@@ -136,6 +152,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     from cleargs.capture.sources import open_capture
     from cleargs.capture.summary import IngestSummary
     from cleargs.media.image import read_rgb
+    from cleargs.models.registry import installed_files
 
     config, work, reporter = context.config, context.checkpoints, context.reporter
     capture = open_capture(context.source, config)
@@ -158,6 +175,11 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     long_side = max(config.feature_size, config.max_size)
     capture = select_sharp_frames(capture, long_side, reporter, by_motion=config.fps is None)
     frames = prepare(capture, work, long_side, reporter)
+    if installed_files("people"):
+        from cleargs.capture.movers import with_movers
+        from cleargs.models.detector import load_detector
+
+        frames = with_movers(frames, work, load_detector().boxes, reporter)
     program = (VERSION, *map(metadata.version, LIBRARIES))
     scene = reconstruct(
         frames,

@@ -29,7 +29,7 @@ VERSION = 56
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
-    "ingest": ("frames.parquet", "motion.parquet", "images", "masks"),
+    "ingest": ("frames.parquet", "motion.parquet", "images", "masks", "movers.parquet"),
     "rva": ("frames.parquet",),
     "g0": TRAINED,
 }

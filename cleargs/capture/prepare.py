@@ -51,6 +51,8 @@ class WorkFrame:
     """True if the mask of the frame is the transparency of its image."""
     cut_out: bool = False
     """True if transparent pixels are empty; the alpha is below the folder of alphas, named like the image."""
+    movers: tuple[tuple[int, int, int, int], ...] | None = None
+    """Boxes of what may move (left, top, right, bottom, px); None: not looked for. See `movers`."""
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:

@@ -17,7 +17,7 @@ from cleargs.capture.loose_points import LoosePoints
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import Prediction, SfmOutcome
-from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
+from cleargs.capture.tables import FRAMES, MOVERS, OBSERVATIONS, POINTS
 from cleargs.capture.undistort import undistorter
 from cleargs.errors import StageError
 from cleargs.files import make_folder, remove
@@ -46,11 +46,13 @@ def publish(
     """
     make_folder(out / "images", empty=True)
     remove(out / "masks")  # without the folder, no frame has a mask
+    remove(out / "movers.parquet")
     if any(frame.masked for frame in frames):
         make_folder(out / "masks")
     flat: list[Intrinsics] = []
     numbers: dict[Intrinsics, int] = {}
     images: dict[int, ModelImage] = {}
+    movers: list[dict[str, int]] = []
     sums = np.zeros((len(model.point_ids), 3))
     samples = np.zeros(len(model.point_ids), np.int64)
     lenses = _cameras(frames, model)
@@ -74,6 +76,7 @@ def publish(
             if frame.masked:
                 mask = read_mask(work / "masks" / f"{frame.image}.png")
                 write_mask(out / "masks" / frame.image, undistortion.mask(mask))
+            movers += [{"frame_id": index, **undistortion.box(corners)} for corners in frame.movers or ()]
             if frame.image in registered:
                 xy = undistortion.points(registered[frame.image].xy)
                 image = replace(registered[frame.image], xy=xy).select(undistortion.inside(xy))
@@ -105,6 +108,8 @@ def publish(
         for index, (frame, camera) in enumerate(zip(frames, flat, strict=True))
     ]
     write_table(out / "frames.parquet", pa.Table.from_pylist(table, FRAMES), FRAMES)
+    if any(frame.movers is not None for frame in frames):
+        write_table(out / "movers.parquet", pa.Table.from_pylist(movers, MOVERS), MOVERS)
     _write_points(out, published, rgb_mean, counts[kept].astype(np.int32), loose)
     write_model(out / "colmap" / "sparse" / "0", published, rgb_mean)
     return published

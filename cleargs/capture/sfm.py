@@ -356,7 +356,7 @@ def job_of(
     return Job(
         folder=folder,
         images=folder / "images",
-        masks=folder / "masks" if any(frame.masked for frame in frames) else None,
+        masks=_masks(frames, folder),
         names=[frame.image for frame in frames],
         cameras=cameras,
         camera_of=[numbers[owner] for owner in owners],
@@ -368,6 +368,13 @@ def job_of(
         seed=seed,
         threads=threads,
     )
+
+
+def _masks(frames: Sequence[WorkFrame], folder: Path) -> Path | None:
+    """Return the folder of the masks of features; None if no frame has one."""
+    if any(frame.movers for frame in frames):
+        return folder / "features"
+    return folder / "masks" if any(frame.masked for frame in frames) else None
 
 
 def _input_size(frame: WorkFrame) -> int:

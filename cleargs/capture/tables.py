@@ -67,6 +67,9 @@ class Frame:
         float | None, "median distance of these from their places, px of the working image"
     ] = None
 
+    movers: tuple[tuple[int, int, int, int], ...] | None = None
+    """Boxes of what may move (left, top, right, bottom, px), of `MOVERS`; None: it was not looked for."""
+
     @property
     def pose(self) -> Pose:
         """Pose in the normalised world. Raises ValueError if the frame has none."""
@@ -101,6 +104,15 @@ OBSERVATIONS = pa.schema(
 )
 
 
+MOVERS = pa.schema(
+    [
+        column("frame_id", pa.int32(), "frame that shows a person, an animal, a vehicle or a screen"),
+        *(column(side, pa.int32(), "side of its box, px") for side in ("left", "top", "right", "bottom")),
+    ]
+)
+"""``movers.parquet``, if the model ``people`` is installed: see `cleargs.capture.movers`."""
+
+
 @dataclass(frozen=True)
 class Points:
     """The sparse points, by point_id."""
@@ -120,13 +132,30 @@ class Points:
 def load_frames(ingest_dir: Path) -> list[Frame]:
     """Return all frames of a finished ingest folder by frame_id, unregistered ones too. Raises StoreError."""
     table = read_table(ingest_dir / "frames.parquet", FRAMES)
-    frames = []
+    frames, movers = [], _load_movers(ingest_dir / "movers.parquet")
     for row in table.to_pylist():
         if not is_inside(row["image"]):
             raise StoreError(f"{ingest_dir} names an image outside", hint="do not use this run")
         mask = f"masks/{Path(row['image']).stem}.png"
-        frames.append(Frame(**row, mask=mask if (ingest_dir / mask).is_file() else None))
+        frames.append(
+            Frame(
+                **row,
+                mask=mask if (ingest_dir / mask).is_file() else None,
+                movers=None if movers is None else tuple(movers.get(row["frame_id"], ())),
+            )
+        )
     return sorted(frames, key=lambda frame: frame.frame_id)
+
+
+def _load_movers(path: Path) -> dict[int, list[tuple[int, int, int, int]]] | None:
+    """Return the boxes of what may move, by frame_id; None if it was not looked for."""
+    if not path.is_file():
+        return None
+    movers: dict[int, list[tuple[int, int, int, int]]] = {}
+    for row in read_table(path, MOVERS).to_pylist():
+        box = row["left"], row["top"], row["right"], row["bottom"]
+        movers.setdefault(row["frame_id"], []).append(box)
+    return movers
 
 
 def load_points(ingest_dir: Path) -> Points:

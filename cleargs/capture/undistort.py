@@ -16,7 +16,7 @@ from cleargs.types import ImageU8, MaskU8, PlaneF32
 MAX_TANGENT = 1.75
 """A pinhole image reaches at most 60 degrees off its axis: fisheye images are cropped there."""
 
-_EDGE_SAMPLES = 256
+_EDGE_SAMPLES, _BOX_SAMPLES = 256, 9
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,19 @@ class Undistorter:
         Positions that a fisheye sees at 90 degrees or more off its axis are NaN: no flat image shows them.
         """
         return np.asarray(_tangents(self._lens, xy) * self.pinhole.focal + np.array(self.pinhole.centre))
+
+    def box(self, corners: tuple[int, int, int, int]) -> dict[str, int]:
+        """Map a box (left, top, right, bottom, px) to the published image, by its outline."""
+        left, top, right, bottom = corners
+        across, down = np.linspace(left, right, _BOX_SAMPLES), np.linspace(top, bottom, _BOX_SAMPLES)
+        ends = np.concatenate([np.full_like(across, end) for end in (top, bottom)])
+        sides = np.concatenate([np.full_like(down, side) for side in (left, right)])
+        x, y = np.concatenate([np.tile(across, 2), sides]), np.concatenate([ends, np.tile(down, 2)])
+        xy = self.points(np.stack([x, y], axis=1))
+        size = np.array([self.pinhole.width, self.pinhole.height])
+        low, high = (np.clip(end(xy, axis=0), 0, size) for end in (np.nanmin, np.nanmax))
+        sides_px = (*np.floor(low), *np.ceil(high))
+        return dict(zip(("left", "top", "right", "bottom"), map(int, sides_px), strict=True))
 
     def inside(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:  # [K, 2]
         """Return True for each position inside the published image."""

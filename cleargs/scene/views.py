@@ -38,7 +38,8 @@ def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
     estimated = frame.placed not in (None, GIVEN)
     time = float(frame.frame_id) if frame.time_s is None else frame.time_s
     load, transparency = partial(_load, image, mask), partial(_alpha, image)
-    return TrainingView(frame.frame_id, camera, weight, "real", load, estimated, time, transparency)
+    movers = frame.movers or ()
+    return TrainingView(frame.frame_id, camera, weight, "real", load, estimated, time, transparency, movers)
 
 
 def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[TrainingView]:

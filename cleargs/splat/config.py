@@ -72,7 +72,8 @@ class FormationConfig(FrozenModel):
     movement: Literal["auto", "on", "off"] = Field(
         "auto",
         description="do not train on regions that move: they differ from the scene of the other frames; "
-        "auto = where RVA finds something in front of the scene in a frame (ghosting of 0.3 or more)",
+        "auto = where RVA finds something in front of the scene in a frame (ghosting of 0.3 or more); with "
+        "the model people, where a person, an animal, a vehicle or a screen is seen",
     )
 
     @field_validator("pose", mode="before")

@@ -41,6 +41,8 @@ class TrainingView:
     """Capture time of the frame, s; without a clock, its number in the capture; NaN if neither is known."""
     transparency: Callable[[], MaskU8 | None] | None = None
     """Function that returns the alpha [H, W] of a cut-out, whose transparent pixels are empty; else None."""
+    movers: tuple[tuple[int, int, int, int], ...] = ()
+    """Boxes of what may move (left, top, right, bottom, px); see `cleargs.formation.movement`."""
 
 
 class ViewDataset(torch.utils.data.Dataset[dict[str, Any]]):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cleargs.formation.movement import Movement, read_movement, regions, static_pixels, write_movement
+from cleargs.formation.movement import Boxes, Movement, read_movement, regions, static_pixels, write_movement
 from cleargs.splat.camera import Camera
 from cleargs.splat.types import Render
 
@@ -36,13 +36,15 @@ def with_disc(where: Tensor) -> Tensor:
     return seen
 
 
-def movement(apart: float = STEP, tolerance: float = 0.05) -> Movement:
+def movement(
+    apart: float = STEP, tolerance: float = 0.05, likely: dict[int, Boxes] | None = None
+) -> Movement:
     cameras = {}
     for k in range(FRAMES):
         pose = np.eye(4)
         pose[0, 3] = -apart * k
         cameras[k] = Camera(WIDTH, HEIGHT, 160.0, 160.0, WIDTH / 2, HEIGHT / 2, pose)
-    return Movement(cameras, tolerance)
+    return Movement(cameras, tolerance, likely=likely)
 
 
 def look(
@@ -86,6 +88,26 @@ def test_a_thing_in_one_frame_does_not_count_and_the_rest_does() -> None:
     mask = disc(150)
     both = still(found, 2, mask)
     assert both is not None and torch.equal(both, counts & mask)
+
+
+def test_less_evidence_suffices_where_a_person_is_seen() -> None:
+    faint = {2: picture() + 0.035 * disc(radius=8)[..., None]}
+    box = {2: ((50, 40, 70, 60),)}
+    assert looked(faint).masks() == {}
+    found = looked(faint, movement(likely=box))
+    counts = still(found, 2)
+    assert counts is not None and not counts[disc(radius=8)].any() and counts[~disc(radius=40)].all()
+    elsewhere = looked(faint, movement(likely={2: ((120, 40, 140, 60),), 3: ((50, 40, 70, 60),)}))
+    assert elsewhere.masks() == {}
+    assert looked({}, movement(likely=box)).masks() == {}
+
+
+def test_a_person_who_stays_is_a_part_of_the_scene() -> None:
+    shift = 160.0 * STEP / DEPTH  # px between two frames
+    places = [80 - shift * k for k in range(FRAMES)]
+    boxes = {k: ((int(x) - 20, 30, int(x) + 20, 70),) for k, x in enumerate(places)}
+    seen = {k: with_disc(disc(x)) for k, x in enumerate(places)}
+    assert looked(seen, movement(likely=boxes)).masks() == {}
 
 
 def test_what_most_frames_show_at_the_same_place_is_not_movement() -> None:

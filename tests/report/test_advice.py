@@ -91,6 +91,19 @@ def test_a_short_training_gets_the_command_for_a_longer_one(
     assert worths == sorted(worths, reverse=True)
 
 
+@pytest.mark.parametrize("figure", ["exposure_spread", "colour_spread"])
+@pytest.mark.parametrize(
+    ("spread", "on", "advised"), [(0.2, False, True), (0.2, True, False), (0.0, False, False)]
+)
+def test_colours_that_differ_get_exposure_compensation(
+    tmp_path: Path, figure: str, spread: float, on: bool, advised: bool
+) -> None:
+    facts = {"steps": 3200, "exposure": on, figure: spread}
+    manifests = ingest(40) | {"g0": SimpleNamespace(summary=facts, missing=())}
+    found = advice(tmp_path, [frame() for _ in range(40)], manifests)
+    assert any(shown.command.endswith("--set g0.exposure=on") for shown in found) is advised
+
+
 def test_printed_commands_run_as_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -267,4 +267,8 @@ def test_movement_is_looked_for_where_something_hides_the_scene(
     asked: str, ghosting: float, expected: bool
 ) -> None:
     config = G0Config.model_validate({"formation": {"movement": asked}})
-    assert g0.movement_expected(config, [{"b_ghosting": 0.0}, {"b_ghosting": ghosting}]) is expected
+    cues = [{"b_ghosting": 0.0}, {"b_ghosting": ghosting}]
+    assert g0.movement_expected(config, cues, [None, None]) is expected
+    # With a detector, what it sees replaces the cue.
+    assert g0.movement_expected(config, cues, [(), ()]) is (asked == "on")
+    assert g0.movement_expected(config, cues, [(), ((0, 0, 9, 9),)]) is (asked != "off")
