@@ -19,6 +19,7 @@ class Stream(IntEnum):
     ADDED_POINTS = 100
     LEFT_OUT_POINTS = 101
     UNSEEN_PIXELS = 102
+    MATCHED_POINTS = 103
 
     # For synthetic captures.
     ROOM = 11

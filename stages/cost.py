@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.errors import StoreError
 from cleargs.pipeline.stage import Estimate, StageContext
-from cleargs.splat.budget import TrainingCost, training_cost
+from cleargs.splat.budget import TrainingCost, planned_start, resolved, training_cost
 
 if TYPE_CHECKING:
     from cleargs.scene.config import G0Config
@@ -41,7 +41,10 @@ def _sparse_points(context: StageContext[Any]) -> int:
 
 def first_training(context: StageContext[Any], g0: G0Config) -> TrainingCost:
     """Return the cost of G0."""
-    return training_cost(g0, *capture_size(context), max(g0.min_points, _sparse_points(context)))
+    frames, megapixels = capture_size(context)
+    config = resolved(g0, frames, round(frames * megapixels * 1e6))
+    config, start = planned_start(config, _sparse_points(context), g0.min_points)
+    return training_cost(config, frames, megapixels, start)
 
 
 def distillation(context: StageContext[Any], config: DistilConfig) -> TrainingCost:

@@ -10,7 +10,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.scene.config import G0Config, kernel_libraries
 from cleargs.scene.folder import LOG, TRAINED
 
-VERSION = 49
+VERSION = 50
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -64,7 +64,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.scene.training import train_into
     from cleargs.scene.views import real_views, seen_points
     from cleargs.splat.backend import mean_psnr, set_threads
-    from cleargs.splat.budget import resolve_config
+    from cleargs.splat.budget import planned_start, resolve_config
     from cleargs.splat.initialise import starting_gaussians
     from cleargs.splat.scene import BLACK, Scene
     from cleargs.splat.views import require_views
@@ -77,11 +77,11 @@ def run(context: StageContext[G0Config]) -> StageResult:
     require_views(views)
     sparse = seen_points(load_points(ingest), ingest, views)
 
-    config = resolve_config(config, views)
+    config, start = planned_start(resolve_config(config, views), len(sparse.xyz), config.min_points)
     gaussians = starting_gaussians(
         sparse,
         views,
-        at_least=config.min_points,
+        at_least=start,
         at_most=config.budget,
         sh_degree=config.sh_degree,
         seed=context.seed,

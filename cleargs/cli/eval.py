@@ -282,8 +282,10 @@ def _print(report: Report, output: Path | None) -> None:
         arrow = "↓" if metric in LOWER_IS_BETTER else "↑"
         table.add_column(f"{_LABELS.get(metric, Path(metric).stem)} {arrow}", justify="right")
     for evaluation in report.evaluations:
-        figures = (_figure(metric, evaluation.means[metric]) for metric in metrics)
-        table.add_row(_subject(evaluation), f"mean of {len(evaluation.images)}", *figures)
+        rows = {f"mean of {len(evaluation.images)}": evaluation.means, "as filmed": evaluation.formed}
+        for images, means in rows.items():
+            if means:
+                table.add_row(_subject(evaluation), images, *(_figure(name, means[name]) for name in metrics))
     console = Console(highlight=False, markup=False, soft_wrap=True)  # names may contain brackets
     if line := _seen_before(report):
         console.print(line)
@@ -331,8 +333,6 @@ def _regions(evaluation: Evaluation) -> list[str]:
     plain, aligned = evaluation.means.get("psnr"), evaluation.psnr_colour_aligned
     if plain is not None and aligned is not None and aligned - plain > EXPOSURES_DIFFER:
         lines.append(f"exposures differ: {aligned:.2f} dB with aligned colours (--align-colour)")
-    if evaluation.psnr_formed is not None:
-        lines.append(f"as the camera took the frames: {evaluation.psnr_formed:.2f} dB")
     if evaluation.covered is not None:
         lines.append(f"behind Gaussians in front of the true surface: {evaluation.covered:.1%} of the pixels")
     return lines

@@ -114,10 +114,11 @@ class ImageResult(Figures):
         description="Share of the image that Gaussians in front of the true surface cover; null where the "
         "reference has no depth.",
     )
-    psnr_formed: float | None = Field(
-        None,
-        description="dB, of the scene as its camera took the frame: with the measured motion during the "
-        "readout, and during the exposure time of the training's frames; null where none was measured.",
+    formed: dict[str, float | None] = Field(
+        {},
+        description="Metric -> value of the scene as its camera took the frame: with the measured motion "
+        "during the readout, and during the exposure time of the training's frames; empty where none was "
+        "measured.",
     )
 
 
@@ -140,7 +141,7 @@ class Evaluation(Figures):
     far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
     clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
     covered: float | None = Field(None, description="Mean of `covered` over the images.")
-    psnr_formed: float | None = Field(None, description="Mean of `psnr_formed` over the images.")
+    formed: dict[str, float | None] = Field({}, description="Metric -> mean of `formed` over the images.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
     weights: dict[str, str] = Field(description="Metric -> digest of the weights behind it.")
     trained_on: int | None = Field(
@@ -229,7 +230,10 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             column("psnr_white", pa.float64(), "dB, of the scene over white", nullable=True),
             column("psnr_between", pa.float64(), "dB, between background and white", nullable=True),
             column("covered", pa.float64(), "share of the image that floaters cover", nullable=True),
-            column("psnr_formed", pa.float64(), "dB, as the camera took the frame", nullable=True),
+            *(
+                column(f"formed_{name}", pa.float64(), "the same as the camera took the frame", nullable=True)
+                for name in metrics
+            ),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
             column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),
@@ -251,6 +255,7 @@ def _row(evaluation: Evaluation, image: ImageResult) -> dict[str, Any]:
         "adjusted": ", ".join(fitted) or "nothing",
         **dict(image),
         **image.values,
+        **{f"formed_{name}": value for name, value in image.formed.items()},
         "colour": None if image.colour is None else [x for line in image.colour for x in line],
     }
     for name, part in {"far": image.far, "clipped": image.clipped, "refined": image.refinement}.items():

@@ -147,9 +147,9 @@ def _evaluate(
             far=None if prediction.far is None else metrics.region(pixels, target, prediction.far, mask),
             clipped=metrics.region(pixels, target, metrics.clipped_pixels(target), mask),
             covered=prediction.covered,
-            psnr_formed=None
+            formed={}
             if prediction.formed is None
-            else metrics.psnr(to_uint8(prediction.formed), target, mask),
+            else measures.measure(to_uint8(prediction.formed), target, mask),
         )
 
     images: list[ImageResult] = []
@@ -186,7 +186,11 @@ def _evaluate(
         far=metrics.pooled(image.far for image in images),
         clipped=metrics.pooled(image.clipped for image in images),
         covered=mean_of(image.covered for image in images),
-        psnr_formed=mean_of(image.psnr_formed for image in images),
+        formed={
+            metric: mean_of(image.formed.get(metric) for image in images)
+            for metric in options.metrics
+            if any(image.formed for image in images)
+        },
         unavailable=measures.unavailable,
         weights=measures.weights,
         versions={

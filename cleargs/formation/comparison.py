@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.motion import BEND, FrameMotion, Model, flow_basis, widened
+from cleargs.formation.motion import BEND, TWIST, FrameMotion, Model, flow_basis, widened
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
@@ -60,6 +60,15 @@ class FramePair:
     weight: ArrayF32  # [H, W] 0 where a pixel does not count
     camera: Camera
     margin: int
+
+    @cached_property
+    def finest(self) -> Level:
+        """The comparison at the largest size at which the frame is compared."""
+        return Level(self, scales(self)[-1])
+
+    def levels(self) -> list[Level]:
+        """Return the comparisons at all sizes, the coarsest first."""
+        return [*(Level(self, scale) for scale in scales(self)[:-1]), self.finest]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +137,7 @@ class Level:
             self._holdout = self._fitting = counted
         self._total = max(float(self._holdout.sum(dtype=np.float64)), 1.0)
         self._pair, self._reduced = pair, reduced
+        self._skewed: tuple[bytes, ArrayF32] | None = None  # the last rolling shutter, and its displacements
         self.scale = size[0] / width
         self._across, self._down = (
             (((np.arange(reduced_side) + 0.5) * side / reduced_side - margin) / own - 0.5).astype(np.float32)
@@ -203,7 +213,9 @@ class Level:
         def flow(twist: ArrayF64) -> ArrayF32:
             return cpu.flow(self._basis, twist) if twist.any() else self._nowhere
 
-        offset = self._read(motion) if motion.skew.any() else flow(motion.pose)
+        offset = flow(motion.pose)
+        if motion.skew.any():
+            offset = offset + self._read(motion)
         radius = self._nowhere[0]
         if motion.disc_px > 0.0:
             disc = np.float32(motion.disc_px * self.scale)
@@ -212,19 +224,25 @@ class Level:
         return offset, flow(motion.blur), radius, curve
 
     def _read(self, motion: FrameMotion) -> ArrayF32:
-        """Return the displacements [2, H, W] by the pose and the rolling shutter."""
+        """Return the displacements [2, H, W] by the rolling shutter alone. Those of the last one are kept."""
+        twists = np.stack([np.zeros(TWIST), motion.skew, motion.skew_bend])
+        key = twists.tobytes() + bytes([motion.columns])
+        if self._skewed is not None and self._skewed[0] == key:
+            return self._skewed[1]
         camera = widened(self._pair.camera, self._pair.margin)
         height, width = self._image.shape
         right, down = width / camera.width, height / camera.height
         lens = [right * camera.fx, down * camera.fy, right * camera.cx, down * camera.cy, self.median]
         columns = np.float32(motion.columns)
-        return cpu.read_displacements(
+        read = cpu.read_displacements(
             *self._reduced_depth,
             np.array(lens, np.float32),
-            (right * np.stack([motion.pose, motion.skew, motion.skew_bend])).astype(np.float32),
+            (right * twists).astype(np.float32),
             (1 - columns) * self._down,
             columns * self._across,
         )
+        self._skewed = key, read
+        return read
 
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:
         """Return matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
@@ -244,11 +262,6 @@ class Level:
             OUTLIER,
             active,
         )
-
-
-def finest_level(pair: FramePair) -> Level:
-    """Return the comparison at the largest size at which a frame is compared."""
-    return Level(pair, scales(pair)[-1])
 
 
 def _high_passed(image: ArrayF32) -> ArrayF32:

@@ -15,14 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.comparison import (
-    MIN_RESIDUAL,
-    FramePair,
-    MotionFit,
-    explained_share,
-    finest_level,
-    luminance,
-)
+from cleargs.formation.comparison import MIN_RESIDUAL, FramePair, MotionFit, explained_share, luminance
 from cleargs.formation.frame import FrameFormation, displacement_of, margin_for
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.motion import FrameMotion, Model, widened
@@ -44,6 +37,9 @@ MAX_RISE = 0.03
 """Limit of a check before a frame without a model is searched in a sharp capture: half of the blur that the
 test found must not raise the residual by this share or more. Wrong geometry can look like blur in the test,
 but blurring the render then makes it less like the frame (docs/experiments/formation.md)."""
+CONTRADICTING_GAIN = 0.1
+"""The same for a frame whose blur is a measured motion, if the shutter was measured too. No search of such a
+frame, with gains of up to 0.07, found a better motion (docs/experiments/formation.md)."""
 GROWN_GAIN = 1.25
 """Factor by which the gain must have grown since the last search before a frame is searched again."""
 SEARCHED_SHARE = 0.05
@@ -121,7 +117,9 @@ def fit_motion(
     best = estimate.accepted(found[1:] or found, found[0])
     missing = estimate.unexplained(best)
     if estimate.reason(found, best, missing) is None:
-        return estimate.described(best, min(frame.blur_gain, missing.gain))
+        # A search is rarely better than a measured motion, so it is not repeated for a small change.
+        gain = frame.blur_gain if terms.measured is not None else min(frame.blur_gain, missing.gain)
+        return estimate.described(best, gain)
     found = estimate.searched(found, best, missing)
     best = estimate.accepted(found, found[0])
     return estimate.described(best, estimate.unexplained(best).gain)
@@ -151,7 +149,7 @@ class _Estimate:
         measured = self._terms.measured
         if measured is None or not measured.rolls:
             return None
-        return measured.read(self._shot.camera, finest_level(self._pair).median)
+        return measured.read(self._shot.camera, self._pair.finest.median)
 
     def followed(self) -> list[MotionFit]:
         """Return the fit without blur and defocus, then those of the known or of the measured motion."""
@@ -166,7 +164,7 @@ class _Estimate:
 
     def _resting(self) -> MotionFit:
         """Return the fit without blur and defocus."""
-        level, held = finest_level(self._pair), self._held
+        level, held = self._pair.finest, self._held
         if held is None:
             return level.evaluate("none", FrameMotion(median_depth=level.median))
         return level.evaluate("skew", held)
@@ -184,8 +182,9 @@ class _Estimate:
         if self._terms.exposure_s > 0.0:
             found += self._best_of(measured, np.array([self._terms.exposure_s]))
         if self._frame.steps == 0 or self._terms.curve:
-            coarse = self._best_of(measured, EXPOSURES * measured.frame_s)[0].motion.exposure_s
-            found += self._best_of(measured, NEARER * coarse)
+            tried = [self._exposed(measured, float(time)) for time in EXPOSURES * measured.frame_s]
+            best = min(tried, key=self._pair.finest.cost)  # half of the size is too coarse for short blurs
+            found += self._best_of(measured, NEARER * best.exposure_s)
         return found
 
     def _best_of(self, measured: MeasuredPath, times: ArrayF64) -> list[MotionFit]:
@@ -198,7 +197,7 @@ class _Estimate:
         return _blur_of(fit.motion, self._pair, self._rendered) >= SHORTEST * self._shot.factor
 
     def _exposed(self, measured: MeasuredPath, seconds: float) -> FrameMotion:
-        return measured.exposed(seconds, self._shot.camera, finest_level(self._pair).median)
+        return measured.exposed(seconds, self._shot.camera, self._pair.finest.median)
 
     def _corrected(self, measured: MeasuredPath, path: FrameMotion) -> MotionFit:
         known = measured.measurement(path.exposure_s, self._shot.camera, path.median_depth)
@@ -240,6 +239,8 @@ class _Estimate:
             if terms.curve and (rolls or preferred(found[1:] or found).motion.order > 1):
                 return Reason.CURVE
         enough = max(LOW_WEIGHT_GAIN if terms.low_weight else SEARCH_GAIN, GROWN_GAIN * frame.blur_gain)
+        if best.motion.exposure_s > 0.0 and terms.measured is not None and terms.measured.rolls:
+            enough = max(enough, CONTRADICTING_GAIN)
         blurred = missing.gain > enough and best.residual > MIN_RESIDUAL
         known = best.model not in ("none", "skew")
         if blurred and (known or not terms.only_if_blur_found or self._resembles(missing)):
@@ -248,7 +249,7 @@ class _Estimate:
 
     def _resembles(self, missing: MissingBlur) -> bool:
         """Return True unless half of the missing blur raises the residual too much (`MAX_RISE`)."""
-        level = finest_level(self._pair)
+        level = self._pair.finest
         blur = replace(blur_along(0.5 * missing.length, missing.angle), median_depth=level.median)
         return level.evaluate("blur", blur).explained > -MAX_RISE
 
@@ -275,7 +276,7 @@ class _Estimate:
         if known.model not in ("none", "skew") or (known.model == "skew" and self._held is None):
             motion, model = known.motion, known.model
             if motion.exposure_s > 0.0 or self._held is not None:
-                found.append(finest_level(self._pair).evaluate(model, motion))
+                found.append(self._pair.finest.evaluate(model, motion))
             else:
                 found += refine(self._pair, model, motion, pose=terms.pose)[1:]
         rolls = terms.shutter == "rolling" or self._held is not None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.parquet import read_table, write_table
-from cleargs.splat.initialise import SparsePoints
+from cleargs.splat.sparse_points import SparsePoints
 from cleargs.splat.tables import EXPOSURE
 from cleargs.splat.views import TrainingView
 

@@ -13,16 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.comparison import (
-    COARSE,
-    DISC,
-    LEVELS,
-    FramePair,
-    Level,
-    MotionFit,
-    finest_level,
-    scales,
-)
+from cleargs.formation.comparison import COARSE, DISC, LEVELS, FramePair, Level, MotionFit
 from cleargs.formation.motion import BEND, BLUR, CUBE, POSE, SKEW, TWIST, TWISTS, FrameMotion, Model
 from cleargs.types import ArrayF64
 
@@ -80,7 +71,7 @@ def search(
     With a skew that is ``held``, no other skew is tried. Return the fit without blur first, then those of
     each model. Models with a blur have one per order of the path that was tried.
     """
-    levels = [Level(pair, scale) for scale in scales(pair)]
+    levels = pair.levels()
     coarse = levels[0]
     no_motion = replace(held or FrameMotion(), median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew and held is None else ("blur",)
@@ -120,7 +111,7 @@ def measured_fits(pair: FramePair, motions: Sequence[FrameMotion]) -> list[Motio
 
     The best is chosen on the pixels that take part in fits.
     """
-    level = finest_level(pair)
+    level = pair.finest
     best = min(motions, key=level.cost)
     none = np.zeros(TWIST)
     paths = [best, replace(best, pose=none, bend=none, cube=none)]
@@ -144,7 +135,7 @@ def corrected(pair: FramePair, motion: FrameMotion, measured: Measurement, *, po
 
     Curves stay.
     """
-    level = finest_level(pair)
+    level = pair.finest
     parts = [POSE, BLUR, SKEW]
     active = np.concatenate([np.arange(len(TWISTS) * TWIST)[part] for part in parts])
     times = np.repeat([0.0, measured.exposure, measured.readout], TWIST)
@@ -177,7 +168,7 @@ def refine(
     not change. Return the fit of ``none`` first, then that of ``model`` if it is not ``none``, then that of
     the next order if it was tried.
     """
-    level = finest_level(pair)
+    level = pair.finest
     if model == "none":
         return [level.evaluate("none", FrameMotion())]
     no_motion = FrameMotion(median_depth=level.median)

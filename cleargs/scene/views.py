@@ -13,7 +13,7 @@ import numpy as np
 from cleargs.capture.tables import Frame, Points, load_observations
 from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
-from cleargs.splat.initialise import SparsePoints
+from cleargs.splat.sparse_points import SparsePoints
 from cleargs.splat.views import TrainingView
 from cleargs.types import AnyImage, MaskBool, MaskU8
 

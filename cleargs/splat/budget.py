@@ -21,6 +21,9 @@ STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
 # that half of the frames are searched, and for later times.
 SEARCH_S, SEARCH_AGAIN_S = 0.6, 0.3
 
+START_SHARE = 0.4
+"""Share of its final number of Gaussians that a first training starts from (docs/experiments/training.md)."""
+
 Settings = TypeVar("Settings", bound=TrainConfig)
 
 
@@ -59,14 +62,31 @@ def training_cost(config: TrainConfig, frames: int, megapixels: float, start: in
 
     Unset steps and budget are chosen as in `resolve_config`.
     """
-    budget = config.budget_for(round(frames * megapixels * 1e6))
-    whole = config.model_copy(update={"steps": config.steps_for(frames), "budget": budget})
-    seconds = seconds_by_step(whole, frames, megapixels, min(start, budget)).sum()
-    return TrainingCost(float(seconds), int(gaussians_by_step(whole, min(start, budget))[-1]))
+    whole = resolved(config, frames, round(frames * megapixels * 1e6))
+    assert whole.budget is not None
+    start = min(start, whole.budget)
+    seconds = seconds_by_step(whole, frames, megapixels, start).sum()
+    return TrainingCost(float(seconds), int(gaussians_by_step(whole, start)[-1]))
+
+
+def planned_start(config: Settings, points: int, at_least: int) -> tuple[Settings, int]:
+    """Return ``config`` with its final number of Gaussians as budget, and the number to start from.
+
+    The final number is what growth would reach from one Gaussian per sparse point, or from ``at_least``.
+    ``points`` is the number of sparse points. Steps and budget of ``config`` must be set.
+    """
+    assert config.budget is not None
+    start = min(max(points, at_least), config.budget)
+    final = int(gaussians_by_step(config, start)[-1])
+    return config.model_copy(update={"budget": final}), max(start, round(START_SHARE * final))
 
 
 def resolve_config(config: Settings, views: Sequence[TrainingView]) -> Settings:
     """Return ``config`` with steps and budget. Unset ones follow from the views (see `TrainConfig`)."""
-    pixels = sum(view.camera.width * view.camera.height for view in views)
-    update = {"steps": config.steps_for(len(views)), "budget": config.budget_for(pixels)}
+    return resolved(config, len(views), sum(view.camera.width * view.camera.height for view in views))
+
+
+def resolved(config: Settings, frames: int, pixels: int) -> Settings:
+    """Return ``config`` with steps and budget for active frames with ``pixels`` pixels in total."""
+    update = {"steps": config.steps_for(frames), "budget": config.budget_for(pixels)}
     return config.model_copy(update=update)

@@ -13,9 +13,9 @@ from cleargs.plugins import require_known
 # of frames, Gaussians the number of pixels. `quality` scales both; docs/speed.md lists its cost and gain.
 Quality = Literal["draft", "standard", "high"]
 
-STEPS_PER_FRAME = 50
-MIN_STEPS, MAX_STEPS = 3200, 7200
-STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
+STEPS_PER_FRAME = 25
+MIN_STEPS, MAX_STEPS = 1600, 3600
+STEPS_FACTOR: dict[Quality, float] = {"draft": 0.4, "standard": 1.0, "high": 8.0}
 
 PIXELS_PER_GAUSSIAN = 30
 MIN_BUDGET = 40_000
@@ -102,8 +102,8 @@ class TrainConfig(FrozenModel):
 
     quality: Quality = Field(
         "standard",
-        description="size of all trainings if steps and budget are unset: draft has a quarter of the steps "
-        "of standard and half of its maximum number of Gaussians; high has 4 times the steps and twice the "
+        description="size of all trainings if steps and budget are unset: draft has 40 % of the steps "
+        "of standard and half of its maximum number of Gaussians; high has 8 times the steps and twice the "
         "Gaussians. A draft also follows the recipe draft: at most 60 frames of 640 px, and no repairs",
         json_schema_extra={"recipes": ["draft"]},
     )
@@ -111,7 +111,7 @@ class TrainConfig(FrozenModel):
         None,
         ge=1,
         le=1_000_000,
-        description="optimisation steps, one view each; unset = 50 per active frame, 3,200 to 7,200, times "
+        description="optimisation steps, one view each; unset = 25 per active frame, 1,600 to 3,600, times "
         "the factor of the quality",
     )
     begin: float = Field(0.0, ge=0, lt=1, description="start of this training in the schedule, as a fraction")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from cleargs.random_streams import Stream
 from cleargs.splat.config import INIT_OPACITY, INIT_SCALE
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.matched_points import add_matched_points
+from cleargs.splat.sparse_points import SparsePoints
 from cleargs.splat.views import TrainingView
 
 NEIGHBOURS = 3
@@ -25,16 +27,6 @@ DEPTH_JITTER = 0.05
 
 BLIND_DEPTHS = (0.5, 5.0)
 """Range of depths of added points if a view observes no sparse point (the cameras span a radius of 1)."""
-
-
-@dataclass(frozen=True, eq=False)
-class SparsePoints:
-    """Sparse points, and the training views that observe them."""
-
-    xyz: NDArray[np.float64]  # [P, 3] normalised world
-    rgb: NDArray[np.uint8]  # [P, 3] sRGB
-    observed: list[NDArray[np.int64]]
-    """Rows of ``xyz`` that each view observes."""
 
 
 def starting_gaussians(
@@ -49,17 +41,20 @@ def starting_gaussians(
 ) -> Gaussians:
     """Return the Gaussians that a training starts from, one per sparse point.
 
-    Missing ones are added behind random pixels of the views. If there are too many points, a random subset is
-    used. ``say`` receives a message in both cases.
+    Missing ones are matched between the views (`add_matched_points`), and the rest are added behind random
+    pixels. If there are too many points, a random subset is used. ``say`` receives a message in both cases.
     """
     most = at_most or max(at_least, len(sparse.xyz))
     if len(sparse.xyz) > most:
         say(f"using {most} of {len(sparse.xyz)} sparse points (limit: g0.budget)")
         sparse = subsample_points(sparse, most, seed=seed)
-    missing = min(at_least, most) - len(sparse.xyz)
-    if missing > 0:
-        say(f"starting from {len(sparse.xyz)} sparse points and {missing} added points")
-        sparse = add_points(sparse, views, missing, seed=seed)
+    known = len(sparse.xyz)
+    if (missing := min(at_least, most) - known) > 0:
+        sparse = add_matched_points(sparse, views, missing, seed=seed)
+        matched = len(sparse.xyz) - known
+        if (missing := missing - matched) > 0:
+            sparse = add_points(sparse, views, missing, seed=seed)
+        say(f"starting from {known} sparse, {matched} matched and {missing} random points")
     if sh_degree is None:
         sh_degree = sh_degree_from_views(len(views))
     return from_points(sparse, sh_degree)

@@ -43,8 +43,11 @@ from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.references import Reference, reference_of
+from cleargs.formation.measured import MeasuredPath
+from cleargs.formation.motion import readout_of
 from cleargs.media.exr import write_depth
-from cleargs.media.image import read_rgb, write_mask, write_rgb
+from cleargs.media.image import read_rgb, to_uint8, write_mask, write_rgb
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
@@ -132,6 +135,29 @@ def test_own_renders_are_perfect_in_the_scenes_world(tmp_path: Path) -> None:
     found = measured(run / "g0" / "scene.ply", in_own_world(folder))
     assert psnr_of(found) > NEARLY_EQUAL and found.alignment.world == "scene"
     assert found.images[0].prediction and found.scene is not None
+
+
+def test_a_frame_is_also_compared_as_its_camera_took_it(tmp_path: Path) -> None:
+    """The camera turned by 4 px while it read the frames: only the render with that motion is like them."""
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras())
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME)
+    derivatives = np.zeros((4, 6))
+    derivatives[0, 4] = 4.0 / FOCAL / 0.02
+    path = MeasuredPath(derivatives, np.eye(6), frame_s=1 / 30, depth=1.0, readout_s=0.02)
+    still = in_own_world(folder)
+    views = []
+    for view in still.views:
+        camera = replace(view.camera, readout=readout_of(path.read(view.camera), view.camera))
+        filmed = to_uint8(rasteriser_for("cpu").view(scene, camera).image.clamp(0.0, 1.0).numpy())
+        views.append(replace(view, path=path, load=lambda filmed=filmed: (filmed, None)))
+    found = measured(run / "g0" / "scene.ply", replace(still, views=tuple(views)))
+    formed = found.formed["psnr"]
+    assert formed is not None and formed > psnr_of(found) + 15.0
+    write_report(tmp_path / "eval.json", Report(evaluations=(found,)))
+    rows = pq.read_table(tmp_path / "eval.parquet").to_pylist()
+    assert [row["formed_ssim"] for row in rows] == [image.formed["ssim"] for image in found.images]
+    assert measured(run / "g0" / "scene.ply", still).formed == {}
 
 
 def test_a_library_without_a_distribution_is_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,12 +38,12 @@ def together(first: Gaussians, second: Gaussians) -> Gaussians:
 def test_dust_is_dropped_with_its_moments() -> None:
     truth = splat_toy.gaussians()
     pictures = splat_toy.views(splat_toy.images(truth, 4))
-    far = replace(truth.select(torch.arange(5)), means=torch.tensor([[0.0, 90.0, 0.0]]).repeat(5, 1))
+    far = replace(truth.select(torch.arange(1)), means=torch.tensor([[0.0, 90.0, 0.0]]))
     done = without_dust(trained(together(far, truth)), pictures, None, {}, {}, "cpu")
     kept = done.trained.scene.gaussians
     assert kept.num <= truth.num and float(kept.means.abs().max()) < 1
     numbers = done.trained.state["first.logit_opacities"]
-    assert len(numbers) == kept.num and int(numbers.min()) >= 5
+    assert len(numbers) == kept.num and int(numbers.min()) >= 1
     assert torch.equal(numbers, done.trained.state["strategy.errors"].to(numbers.dtype))
     assert torch.equal(kept.means, together(far, truth).means[numbers.long()])
     assert len(done.trained.state["fingerprint"]) == 32
@@ -62,3 +62,13 @@ def test_faint_gaussians_that_show_together_stay() -> None:
     fits = without_dust(trained(truth), pictures, None, {}, {}, "cpu").fits
     lost = mean_psnr(fit.psnr for fit in whole.fits), mean_psnr(fit.psnr for fit in fits)
     assert lost[0] is not None and lost[1] is not None and lost[0] - lost[1] > MAX_LOSS
+
+
+def test_unseen_gaussians_inside_the_scene_stay() -> None:
+    """They are too small to count alone, and the box does not change without them."""
+    truth = splat_toy.gaussians()
+    few = truth.select(torch.arange(5))
+    small = replace(few, logit_opacities=torch.full((5,), -9.0))
+    pictures = splat_toy.views(splat_toy.images(truth, 4))
+    done = without_dust(trained(together(small, truth)), pictures, None, {}, {}, "cpu")
+    assert done.dropped == 0 and done.trained.scene.gaussians.num == truth.num + 5

@@ -111,7 +111,7 @@ def test_printed_commands_run_as_printed(
     finished = FinishedRun(tmp_path)
     (tmp_path / "my capture").mkdir()
     for k in range(4):
-        image = np.full((48, SIZE, 3), 40 * k, np.uint8)
+        image = np.full((480, 10 * SIZE, 3), 40 * k, np.uint8)
         cv2.imwrite(str(tmp_path / f"my capture/{k}.png"), image)
     run = replace(finished.run, source=tmp_path / "my capture")
     manifests = linked_manifests(finished.folder, finished.dag.names)

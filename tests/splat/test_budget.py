@@ -11,7 +11,7 @@ from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.stages import installed
 from cleargs.scene.config import G0Config
-from cleargs.splat.budget import gaussians_by_step, resolve_config, training_cost
+from cleargs.splat.budget import START_SHARE, gaussians_by_step, planned_start, resolve_config, training_cost
 from cleargs.splat.config import Quality, TrainConfig, budget_from_pixels, steps_from_frames
 from cleargs.splat.trainer import Trainer
 from cleargs.stages.config import DistilConfig
@@ -23,7 +23,7 @@ def test_steps_follow_the_frames_within_bounds() -> None:
     assert steps_from_frames(1000) == steps_from_frames(10_000)
     for frames in (16, 100):
         draft, standard, high = (steps_from_frames(frames, quality) for quality in get_args(Quality))
-        assert 4 * draft == standard and 4 * standard == high
+        assert 5 * draft == 2 * standard and 8 * standard == high
 
 
 def test_the_budget_follows_the_pixels_within_bounds() -> None:
@@ -90,3 +90,16 @@ def test_later_steps_are_estimated_to_take_longer() -> None:
     assert fractions[500] < 0.5, "growth and full-size images are in the second half"
     few, many = (training_cost(config, 100, 0.4, start) for start in (20_000, 400_000))
     assert few.seconds < many.seconds and few.gaussians < many.gaussians == 300_000
+
+
+def test_a_first_training_starts_from_a_share_of_its_final_number() -> None:
+    """Growth from the sparse points sets the final number, and the budget limits it."""
+    config = G0Config(steps=640, budget=100_000, end=1)
+    bounded, start = planned_start(config, 3000, 10_000)
+    assert bounded.budget == gaussians_by_step(config, 10_000)[-1]
+    assert start == round(START_SHARE * bounded.budget) > 10_000
+    assert gaussians_by_step(bounded, start)[-1] == bounded.budget
+    many, start = planned_start(config, 90_000, 10_000)
+    assert (many.budget, start) == (100_000, 90_000)
+    fixed, start = planned_start(config.model_copy(update={"densify": "off"}), 3000, 10_000)
+    assert (fixed.budget, start) == (10_000, 10_000)

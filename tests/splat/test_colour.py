@@ -20,7 +20,7 @@ from cleargs.formation.exposure import (
     read_exposure,
     write_exposure,
 )
-from cleargs.splat.initialise import SparsePoints
+from cleargs.splat.sparse_points import SparsePoints
 from cleargs.splat.views import TrainingView
 
 WALL = 0.2

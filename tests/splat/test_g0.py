@@ -132,7 +132,7 @@ def test_only_active_frames_train_the_scene(capture: Path, tmp_path: Path) -> No
     assert first == pytest.approx(ACTIVE)
     scene = read_ply(tmp_path / "out" / "scene.ply")
     summary = dict(result.summary)
-    assert summary["gaussians"] == scene.gaussians.num == 119  # 120 without the one that is dust
+    assert summary["gaussians"] == scene.gaussians.num == 120
     assert (summary["gaussians_start"], summary["views"], summary["sh_degree"]) == (100, 4, 0)
     # Initial colours and positions are correct, so a short training fits the strong frames well. An empty or
     # mirrored scene stays below 15 dB.
