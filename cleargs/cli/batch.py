@@ -152,7 +152,8 @@ def _print_plans(batch: Batch, as_json: bool) -> None:
     total["memory_gb"] = max(plan["memory_gb"] for plan in plans)  # the scenes run one after the other
     lines = []
     for plan in [*plans, {"scene": "total", **total, "note": count(len(plans), "scene")}]:
-        cost = f"{duration(3600 * plan['hours'])}, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
+        time = duration(3600 * plan["hours"])
+        cost = f"{time}, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
         lines.append(f"{plan['scene']}: {cost}; {plan['note']}")
     answer(as_json, {"folder": str(batch.folder), "device": batch.device, **total, "scenes": plans}, *lines)
 

@@ -20,7 +20,7 @@ TEXELS = 100.0  # per unit of the wall
 
 
 def wall(camera: Camera, texture: ImageU8) -> ImageU8:
-    """What a camera sees of a textured wall at z = DEPTH."""
+    """Return the image [H, W, 3] of a textured wall at z = DEPTH."""
     centre, turn = camera.centre, camera.world_to_camera[:3, :3]
     row, column = np.indices((HEIGHT, WIDTH))
     rays = np.stack(
