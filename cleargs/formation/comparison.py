@@ -7,7 +7,7 @@ frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -136,7 +136,8 @@ class Level:
         if not self._holdout.any():  # an image of a few blocks
             self._holdout = self._fitting = counted
         self._total = max(float(self._holdout.sum(dtype=np.float64)), 1.0)
-        self._pair, self._reduced = pair, reduced
+        # A copy, because the pair and its finest level would keep each other in memory.
+        self._pair, self._reduced = replace(pair), reduced
         self._skewed: tuple[bytes, ArrayF32] | None = None  # the last rolling shutter, and its displacements
         self.scale = size[0] / width
         self._across, self._down = (
