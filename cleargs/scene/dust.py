@@ -24,11 +24,11 @@ from cleargs.types import MaskBool
 
 DUST = 0.1
 """Largest contribution of a Gaussian to a training view, pixels, below which it is dust."""
-LOOK = 0.5
+REDUCTION = 0.5
 """Factor on width and height of the pictures that measure contributions: they cost a fourth of full ones."""
 MIDDLE, OUTSIDE = 0.98, 1.5
 """Dust is outside the box of this middle share of the means along each axis, enlarged by this factor. Inside,
-small contributions add up: without them LPIPS rose by a tenth (docs/experiments/training.md)."""
+small contributions add up: without them LPIPS rose by 7 % (docs/experiments/training.md)."""
 MAX_LOSS = 0.02
 """Loss of PSNR on the training views, dB, above which the dust stays."""
 
@@ -56,8 +56,8 @@ def without_dust(
     few, scene = spread(real, MAX_EVALUATED), trained.scene.to(device)
     seen = ~outside(scene.gaussians.means)
     if not seen.all():
-        largest = contributions(scene, (view.camera.scaled(LOOK) for view in real), lambda: None)
-        seen |= largest >= DUST * LOOK**2
+        largest = contributions(scene, (view.camera.scaled(REDUCTION) for view in real), lambda: None)
+        seen |= largest >= DUST * REDUCTION**2
     if seen.all():
         return Dusted(trained, 0, few, evaluate_views(scene, few, exposure, formations, moving=moving))
     smaller = replace(scene, gaussians=scene.gaussians.select(seen))

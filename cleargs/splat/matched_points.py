@@ -97,7 +97,8 @@ def _triangulated(view: TrainingView, partner: TrainingView) -> tuple[ArrayF64, 
     between = two.centre - one.centre
     # Points of both rays that are nearest to each other; the point is in their middle.
     cosine = np.einsum("ni,ni->n", ray, ray_other)
-    along, along_other = ray @ between, ray_other @ between
+    # einsum, not BLAS, whose order of summation may depend on its threads.
+    along, along_other = (np.einsum("ni,i->n", rays, between) for rays in (ray, ray_other))
     sine_squared = np.maximum(1.0 - cosine**2, 1e-12)
     depth = (along - cosine * along_other) / sine_squared
     depth_other = (cosine * along - along_other) / sine_squared
