@@ -14,8 +14,8 @@ from cleargs.plugins import require_known
 Quality = Literal["draft", "standard", "high"]
 
 STEPS_PER_FRAME = 25
-MIN_STEPS, MAX_STEPS = 1600, 3600
-STEPS_FACTOR: dict[Quality, float] = {"draft": 0.4, "standard": 1.0, "high": 8.0}
+MIN_STEPS, MAX_STEPS = 2400, 3600
+STEPS_FACTOR: dict[Quality, float] = {"draft": 1 / 3, "standard": 1.0, "high": 6.0}
 
 PIXELS_PER_GAUSSIAN = 30
 MIN_BUDGET = 40_000
@@ -102,8 +102,8 @@ class TrainConfig(FrozenModel):
 
     quality: Quality = Field(
         "standard",
-        description="size of all trainings if steps and budget are unset: draft has 40 % of the steps "
-        "of standard and half of its maximum number of Gaussians; high has 8 times the steps and twice the "
+        description="size of all trainings if steps and budget are unset: draft has a third of the steps "
+        "of standard and half of its maximum number of Gaussians; high has 6 times the steps and twice the "
         "Gaussians. A draft also follows the recipe draft: at most 60 frames of 640 px, and no repairs",
         json_schema_extra={"recipes": ["draft"]},
     )
@@ -111,7 +111,7 @@ class TrainConfig(FrozenModel):
         None,
         ge=1,
         le=1_000_000,
-        description="optimisation steps, one view each; unset = 25 per active frame, 1,600 to 3,600, times "
+        description="optimisation steps, one view each; unset = 25 per active frame, 2,400 to 3,600, times "
         "the factor of the quality",
     )
     begin: float = Field(0.0, ge=0, lt=1, description="start of this training in the schedule, as a fraction")

@@ -149,7 +149,7 @@ def test_budget_and_degree_depend_on_every_frame(capture: Path, out: Path) -> No
     config = load_config(installed(), "default", ("g0.budget=7",), 0)
     frames = 6 * 160 * 90
     open_ = decide_work(load_config(installed(), "default", (), 0), out / "room-0" / "rva" / "ingest", None)
-    assert open_ == EqualWork(1900, 6, budget_from_pixels(frames, 10**6), sh_degree_from_views(6))
+    assert open_ == EqualWork(2850, 6, budget_from_pixels(frames, 10**6), sh_degree_from_views(6))
     assert decide_work(config, out / "room-0" / "rva" / "ingest", 50) == EqualWork(50, 6, 7, 0)
 
 

@@ -58,9 +58,9 @@ def test_total_of_the_recipe_keeps_its_steps() -> None:
         "g0.sh_degree=1",
         "g0.budget=40000",
         *(
-            "g0.steps=1600",
-            "rivr.distil.steps=100",
-            "consolidate.distil.steps=100",
+            "g0.steps=2400",
+            "rivr.distil.steps=150",
+            "consolidate.distil.steps=150",
         ),  # the minimum steps of the recipe
     )
     assert variant_config(installed(), full, "default", (), 0, work) == load_config(

@@ -18,12 +18,12 @@ from cleargs.stages.config import DistilConfig
 
 
 def test_steps_follow_the_frames_within_bounds() -> None:
-    found = [steps_from_frames(frames) for frames in (1, 60, 80, 120, 1000)]
+    found = [steps_from_frames(frames) for frames in (1, 60, 100, 120, 1000)]
     assert found == sorted(found) and found[0] == found[1] < found[2] < found[3] < found[4]
     assert steps_from_frames(1000) == steps_from_frames(10_000)
     for frames in (16, 100):
         draft, standard, high = (steps_from_frames(frames, quality) for quality in get_args(Quality))
-        assert 5 * draft == 2 * standard and 8 * standard == high
+        assert draft == round(standard / 3) and 6 * standard == high
 
 
 def test_the_budget_follows_the_pixels_within_bounds() -> None:
