@@ -9,6 +9,7 @@ import tempfile
 from types import SimpleNamespace
 from typing import Any
 
+from cleargs import kernel_cache
 from cleargs.kernel_cache import cache_folder, installation
 from cleargs.pipeline.stages import installed
 from cleargs.progress import COMPILING, LineReporter, SilentReporter
@@ -54,7 +55,7 @@ def test_another_installation_compiles_again(monkeypatch, tmp_path):
     finish()
     assert said[0] == f"{COMPILING}: started" and said[1] == "compiled", "announced before it is silent"
     assert said[2].startswith(f"{COMPILING}: done in") and said[3:] == ["compiled"]
-    monkeypatch.setattr("cleargs.kernel_cache.__file__", str(tmp_path / "kernel_cache.py"))
+    monkeypatch.setattr(kernel_cache, "__file__", str(tmp_path / "kernel_cache.py"))
     elsewhere = installation()
     os.utime(source, ns=(1, 1))
     assert len({before, elsewhere, installation()}) == 3

@@ -168,14 +168,16 @@ class OnnxModel:
             yield from pool.map(lambda item: function(item[None])[0], items)
 
 
-def in_batches(function: Callable[[ArrayF32], ArrayF32], items: Sequence[ArrayF32]) -> list[Any]:
+def in_batches(
+    function: Callable[[ArrayF32], ArrayF32], items: Sequence[ArrayF32], max_pixels: int = BATCH_PIXELS
+) -> list[Any]:
     """Return the results of ``function`` for ``items`` [H, W, ...] of one size, computed in batches.
 
-    The batch size is halved if a batch does not fit into the GPU's memory. StageError is raised if one item
-    does not.
+    A batch has at most ``max_pixels``, or one item. Its size is halved if a batch does not fit into the GPU's
+    memory. StageError is raised if one item does not.
     """
     pixels = items[0].shape[0] * items[0].shape[1]
-    size = max(1, BATCH_PIXELS // pixels)
+    size = max(1, max_pixels // pixels)
     results: list[Any] = []
     while len(results) < len(items):
         batch = np.stack(items[len(results) : len(results) + size])

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from toy_batch import ToyBatch
 
+from cleargs.batch import loop
 from cleargs.batch.loop import Batch, program
 from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.main import invoke
@@ -287,7 +288,7 @@ runpy.run_path({toys.program[1]!r}, run_name="__main__")
 
 
 def test_the_signal_that_killed_a_child_is_reported(toys: ToyBatch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cleargs.batch.loop.program", lambda: ["/bin/sh", "-c", "kill -9 $$"])
+    monkeypatch.setattr(loop, "program", lambda: ["/bin/sh", "-c", "kill -9 $$"])
     toys.write_sheet({"attic": ""})
     assert toys.run() == 1
     assert toys.summary()["attic"]["cause"] == "ended by signal 9"

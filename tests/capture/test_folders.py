@@ -17,6 +17,7 @@ from cleargs.capture.prepare import read_source_mask
 from cleargs.capture.sources import externals, open_capture, whole_capture
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
+from cleargs.media import headers
 from cleargs.progress import SilentReporter
 from cleargs.stages.ingest import IngestConfig
 
@@ -315,7 +316,7 @@ def test_folders_of_systems_are_not_read(images: Path, name: str) -> None:
 def test_formats_that_need_a_package_are_left_out_with_a_warning(
     images: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cleargs.media.headers.find_spec", lambda name: None)
+    monkeypatch.setattr(headers, "find_spec", lambda name: None)
     for index in range(3):
         (images / f"IMG_{index}.HIF").write_bytes(b"\0\0\0\x18ftypheic" + bytes(12))
     capture = open_capture(images, IngestConfig())

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from toy import Bench
 
+from cleargs.cli import doctor
 from cleargs.cli.doctor import device_of
 from cleargs.cli.main import COMMANDS, cli, explanation, invoke
 from cleargs.cli.outcome_lines import outcome_lines
@@ -25,6 +26,7 @@ from cleargs.cli.run import without_effect
 from cleargs.gpu import Check, Machine, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.media.encode import write_video
+from cleargs.pipeline import session
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import default_folder, usable_cores
@@ -470,7 +472,7 @@ def test_the_time_left_counts_from_the_first_step_on(
 ) -> None:
     """The first step may wait for the compilation of kernels, so its time does not count."""
     clock = [0.0]
-    monkeypatch.setattr("cleargs.progress.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     with make_reporter().task("G0", 1000) as task:
         for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
             clock[0] = now
@@ -484,7 +486,7 @@ def test_the_time_left_follows_the_work_where_steps_differ(
 ) -> None:
     """Half of the steps may be a quarter of the work: the last steps have the most Gaussians."""
     clock = [0.0]
-    monkeypatch.setattr("cleargs.progress.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     with make_reporter().task("G0", 1000) as task:
         for now, done, share in ((100.0, 1, 0.0), (110.0, 500, 0.25)):
             clock[0] = now
@@ -500,7 +502,7 @@ FAILED = SelfTest(FACTS, [Check("Adam", ["means: differs by 1"], 1.0)])
 def test_auto_uses_a_tested_gpu_and_dry_run_tests_none(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     results = [None, PASSED]
     asked = Machine(lambda: None, lambda: FACTS, lambda facts: results[0], lambda facts, say: results.pop())
-    monkeypatch.setattr("cleargs.pipeline.session.Machine", lambda: asked)
+    monkeypatch.setattr(session, "Machine", lambda: asked)
     assert "device: the CPU, because the GPU is not tested yet" in shell.run("--dry-run")[2]
     assert "device: the GPU, because NVIDIA A1 passed its self-test" in shell.run()[2]
     assert 'device = "cuda"' in (shell.bench.folder / "run.toml").read_text()
@@ -528,7 +530,7 @@ def test_the_doctor_tests_the_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def use(machine: Machine) -> None:
-        monkeypatch.setattr("cleargs.cli.doctor.Machine", lambda: machine)
+        monkeypatch.setattr(doctor, "Machine", lambda: machine)
 
     use(Machine(lambda: "there is no NVIDIA GPU"))
     assert invoke(["doctor", "--gpu"]) == 1
@@ -573,10 +575,10 @@ def test_threads_wait_passively_by_default(own: dict[str, str], policy: str) -> 
 
 
 def test_cores_are_counted_without_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr("os.sched_getaffinity")
-    monkeypatch.setattr("os.cpu_count", lambda: 6)
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 6)
     assert usable_cores() == 6
-    monkeypatch.setattr("os.cpu_count", lambda: None)
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
     assert usable_cores() == 1
 
 

@@ -7,12 +7,15 @@ import json
 import os
 import shutil
 import stat
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import click
 import pytest
 from toy import Bench
 
+from cleargs import digest
 from cleargs.cli import main as main_module
 from cleargs.cli.main import invoke
 from cleargs.digest import files_under
@@ -114,8 +117,8 @@ def test_gc_lists_and_asks(
     bench.run("square.power=3")
     bench.run()
     folders = set((bench.store / "square").iterdir())
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("click.confirm", lambda text, err: answer)
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(click, "confirm", lambda text, err: answer)
     code, said = give("gc", bench.folder)
     assert code == 0 and "finished    square/" in said and "in total" in said
     assert ("nothing was removed" in said) is not answer
@@ -196,7 +199,7 @@ def test_a_run_of_another_does_not_make_commands_search_the_disk(
         write(home / f"{index}/{index}.txt")
     text = (bench.folder / "run.toml").read_text()
     write(bench.folder / "run.toml", text.replace(f'"{bench.capture}"', f'"{home}"'))
-    monkeypatch.setattr("cleargs.digest.MAX_FILES", 20)
+    monkeypatch.setattr(digest, "MAX_FILES", 20)
     assert invoke([command, str(bench.folder)], bench.dag) == 2
     assert "it is not one capture" in capsys.readouterr().err
 

@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -101,7 +102,7 @@ def test_errors_of_the_system_are_explained(error: Exception, code: int, words: 
 
 
 def test_out_of_memory_names_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cleargs.cli.main.resource.getrlimit", lambda _: (2_600_000_000, -1))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (2_600_000_000, -1))
     code, cause, remedy = explanation(MemoryError())
     assert (code, cause) == (1, "out of memory")
     assert "limit on virtual memory, 2.6 GB: ulimit -v unlimited" in remedy

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from cleargs.formation import capture, estimate
 from cleargs.formation.capture import ESTIMATES_TO_KEEP, CaptureFormation
 from cleargs.formation.comparison import MIN_RESIDUAL, FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
@@ -201,7 +202,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> list[FramePair]:
         pairs.append(pair)
         return search(pair, **settings)
 
-    monkeypatch.setattr("cleargs.formation.estimate.search", counted)
+    monkeypatch.setattr(estimate, "search", counted)
     return pairs
 
 
@@ -244,8 +245,8 @@ def test_a_sharp_capture_is_searched_only_where_there_is_evidence(
     modelled: int, searches: int, tmp_path: Path, searched: list[FramePair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four frames were looked at. Two were not, of which one is blurred."""
-    monkeypatch.setattr("cleargs.formation.capture.MIN_SEARCHED_FRAMES", 4)
-    monkeypatch.setattr("cleargs.formation.capture.SHARP_SHARE", 1 / 4)
+    monkeypatch.setattr(capture, "MIN_SEARCHED_FRAMES", 4)
+    monkeypatch.setattr(capture, "SHARP_SHARE", 1 / 4)
     looked = known(**{f"f{k}": FrameMotion(blur=np.zeros(6)) for k in range(4, 4 + modelled)})
     steps = {k: 0 if k in (0, BLURRED) else LOOK.every + 1 for k in looked}  # their next look is later
     first = {k: replace(frame, steps=steps[k]) for k, frame in looked.items()}
@@ -269,7 +270,7 @@ def test_a_frame_is_not_searched_if_the_blur_of_the_test_makes_it_worse(
 ) -> None:
     """All frames have noise. The test is replaced by one that sees a blur of 7 px across in each."""
     found = MissingBlur(line_gain=0.2, line=49.0 / 12.0, angle=0.0, disc_gain=0.0, disc=0.0)
-    monkeypatch.setattr("cleargs.formation.estimate.missing_blur", lambda *_: found)
+    monkeypatch.setattr(estimate, "missing_blur", lambda *_: found)
     rng = np.random.default_rng(0)
     seen = []
     for view in views():
@@ -324,7 +325,7 @@ def test_a_later_training_keeps_what_was_looked_at_often(
         looked.append(frame.frame_id)
         return frame
 
-    monkeypatch.setattr("cleargs.formation.capture.fit_motion", look)
+    monkeypatch.setattr(capture, "fit_motion", look)
     often = {
         k: replace(frame, steps=(ESTIMATES_TO_KEEP - 1) * LOOK.every + 1)
         for k, frame in known(f2=BLUR).items()
@@ -347,7 +348,7 @@ def test_frames_of_a_rolling_shutter_are_looked_at_in_every_training(
         looked.append(frame.frame_id)
         return frame
 
-    monkeypatch.setattr("cleargs.formation.capture.fit_motion", look)
+    monkeypatch.setattr(capture, "fit_motion", look)
     steps = ESTIMATES_TO_KEEP * LOOK.every
     rolling = {k: FrameFormation(k, BLUR, "blur", skew_gain=0.2, steps=steps) for k in range(FRAMES)}
     run(tmp_path, views(), CaptureFormation(views(), LOOK, known=rolling))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from cleargs.formation import estimate
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
@@ -53,7 +54,7 @@ def test_a_measured_blur_needs_no_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
 ) -> None:
     """Only its exposure time is unknown."""
-    monkeypatch.setattr("cleargs.formation.estimate.search", None)
+    monkeypatch.setattr(estimate, "search", None)
     seen = filmed({BLURRED: blurred()})
     formation = CaptureFormation(seen, LOOK, measured={k: measured(error=error) for k in range(FRAMES)})
     run(tmp_path, seen, formation)

@@ -14,6 +14,7 @@ from helpers import splat_toy
 from helpers.warp_oracle import ALL, BENT, SCALE, SMALL, constant_fields, placed, random_image, scenery
 from torch import Tensor
 
+from cleargs.formation import capture
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
@@ -103,7 +104,7 @@ def test_a_training_through_the_warp_follows_the_cpu(
     monkeypatch.setattr(splat_toy, "WIDTH", 20)
     monkeypatch.setattr(splat_toy, "HEIGHT", 16)
     # The motions are given: a search would decide near ties by the last bit.
-    monkeypatch.setattr("cleargs.formation.capture.fit_motion", lambda frame, *given, **options: frame)
+    monkeypatch.setattr(capture, "fit_motion", lambda frame, *given, **options: frame)
     rng = np.random.default_rng(0)
     views = splat_toy.views([rng.integers(0, 256, (16, 20, 3), dtype=np.uint8) for _ in range(3)])
     depth = {"median_depth": 1.0}

@@ -22,7 +22,7 @@ FACTS = {"gpu": "Triton's interpreter", "driver": "none"}
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the folder of cached results."""
-    monkeypatch.setattr("cleargs.gpu.cache_folder", lambda name: tmp_path)
+    monkeypatch.setattr(gpu, "cache_folder", lambda name: tmp_path)
     return tmp_path
 
 
@@ -80,13 +80,17 @@ def plant(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     def fail(*given: object, **options: object) -> None:
         raise error
 
-    monkeypatch.setattr("cleargs.splat.kernels.cuda.backend.loss_sums", fail)
+    from cleargs.splat.kernels.cuda import backend
+
+    monkeypatch.setattr(backend, "loss_sums", fail)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a kernel that is compiled keeps its constants")
 def test_a_wrong_kernel(run: Callable[..., SelfTest], monkeypatch: pytest.MonkeyPatch) -> None:
     window = [1.01 * weight for weight in gpu_window()]
-    monkeypatch.setattr("cleargs.splat.kernels.cuda.device_layout.SSIM_WINDOW", tuple(window))
+    from cleargs.splat.kernels.cuda import device_layout
+
+    monkeypatch.setattr(device_layout, "SSIM_WINDOW", tuple(window))
     tested = run()
     (loss,) = (check for check in tested.checks if check.faults)
     assert loss.name == "loss and colour"
@@ -120,7 +124,7 @@ def test_values_that_are_not_finite(run: Callable[..., SelfTest], monkeypatch: p
 
 def test_a_memory_that_grows(run: Callable[..., SelfTest], monkeypatch: pytest.MonkeyPatch) -> None:
     held = itertools.count(100, 512)
-    monkeypatch.setattr("torch.cuda.memory_allocated", lambda *device: next(held))
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda *device: next(held))
     assert run(timed=True).fault == "memory: grows by 512 bytes in 4 training steps"
 
 

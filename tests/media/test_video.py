@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.media import video
 from cleargs.media.colour import KNEE, LUMA, linear_from_srgb, srgb_from_hdr, srgb_from_linear, tone_map
 from cleargs.media.encode import write_video
 from cleargs.media.video import decode_frames, decode_grey, read_timeline
@@ -192,7 +193,7 @@ def test_pixels_become_square(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     height, width = bar_planes("bt709", False)[0].shape
     assert wide.shape == (height, round(4 * width / 3), 3)
     # A damaged header must not ask for all memory.
-    monkeypatch.setattr("cleargs.media.video.MAX_PIXELS", width * height)
+    monkeypatch.setattr(video, "MAX_PIXELS", width * height)
     with pytest.raises(InputError, match=r"clip\.mp4: a frame would have .* square pixels"):
         next(decode_frames(path, read_timeline(path).pts[:1]))
 

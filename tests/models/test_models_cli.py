@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ def test_model_dir_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_
     assert model_dir() == tmp_path
     monkeypatch.delenv("CLEARGS_MODELS")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr(sys, "platform", "linux")
     assert model_dir() == tmp_path / "cleargs" / "models"
 
 

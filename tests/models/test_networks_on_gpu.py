@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import StageError
+from cleargs.models import tiling
 from cleargs.models.expert import OnnxExpert
 from cleargs.models.onnx import CUDA_PROVIDER, OnnxModel, in_batches, network_device
 from cleargs.models.registry import model_file
@@ -93,25 +94,22 @@ def items(count: int) -> list[Floats]:
     return [np.full((2, 3), number, np.float32) for number in range(count)]
 
 
-def test_batches_keep_the_order_and_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 25)
+def test_batches_keep_the_order_and_their_size() -> None:
     sizes = []
 
     def run(batch: Floats) -> Floats:
         sizes.append(len(batch))
         return -batch
 
-    results = in_batches(run, items(10))
+    results = in_batches(run, items(10), 25)
     assert sizes == [4, 4, 2]
     assert [result[0, 0] for result in results] == [-number for number in range(10)]
     sizes.clear()
-    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 5)
-    in_batches(run, items(2))
+    in_batches(run, items(2), 5)
     assert sizes == [1, 1]
 
 
-def test_a_batch_that_does_not_fit_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 48)
+def test_a_batch_that_does_not_fit_is_halved() -> None:
     tried = []
 
     def run(batch: Floats) -> Floats:
@@ -120,7 +118,7 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch: pytest.MonkeyPatch) ->
             raise MemoryError("Failed to allocate memory for requested buffer of size 8589934592")
         return batch
 
-    results = in_batches(run, items(5))
+    results = in_batches(run, items(5), 48)
     assert tried == [5, 2, 2, 1]
     assert [result[0, 0] for result in results] == list(range(5))
 
@@ -145,7 +143,7 @@ def test_batches_restore_and_score_as_single_tiles_do(monkeypatch: pytest.Monkey
     path = model_file(CLARITY, "scorer")
     assert path is not None
     scorer = LearnedScorer(path, CLARITY, 64)
-    monkeypatch.setattr("cleargs.models.tiling.FREE_TILE", 128)
+    monkeypatch.setattr(tiling, "FREE_TILE", 128)
     single, score = expert.restore(image), scorer.score(image)
     monkeypatch.setattr(OnnxModel, "takes_batches", True)
     together = expert.restore(image)

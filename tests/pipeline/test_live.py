@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def test_a_damaged_progress_file_is_ignored(
 def test_the_task_that_advanced_last_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "WRITE_INTERVAL_S", 0.0)
     now = [0.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     with recorded_progress(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
 
         def note() -> dict[str, Any]:
@@ -122,7 +123,7 @@ def test_the_task_that_advanced_last_is_written(tmp_path: Path, monkeypatch: pyt
 
 def test_the_seconds_of_compiling_are_counted_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     with recorded_progress(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
         for label, seconds in (("G0", 5.0), (COMPILING, 30.0), ("G0", 7.0)):
             with reporter.task(label):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import platform
 from pathlib import Path
 from typing import Any
 
 import pytest
 from toy import Bench, make_bench
 
+from cleargs import manifest
 from cleargs.digest import DigestMemo
 from cleargs.manifest import instruction_set, linked_manifest, read_manifest, write_manifest
 from cleargs.pipeline.stage import StageContext, StageResult
@@ -22,11 +24,11 @@ FLAGS = "flags\t\t: fpu sse sse2 cx16 popcnt sse4_1 sse4_2{}\nbugs : none\n"
 def test_the_instruction_set_has_a_short_name(
     more: str, level: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("platform.machine", lambda: "x86_64")
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     (tmp_path / "cpuinfo").write_text(FLAGS.format(more))
     assert instruction_set(tmp_path / "cpuinfo") == f"x86-64-v{level}"
     assert instruction_set(tmp_path / "absent") == "x86_64"
-    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     assert instruction_set(tmp_path / "cpuinfo") == "aarch64"
 
 
@@ -47,7 +49,7 @@ class Machine:
             return result
 
         with self._patch.context() as patch:
-            patch.setattr("cleargs.manifest.instruction_set", lambda: self.kind)
+            patch.setattr(manifest, "instruction_set", lambda: self.kind)
             patch.setattr(type(self._count), "run", rounded)
             return {outcome.stage: outcome.how for outcome in self.bench.run(force=force)}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -175,7 +176,7 @@ def test_killed_during_cleanup_leaves_no_partial_checkpoints(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("cleargs.pipeline.store.shutil.rmtree", killed)
+        patch.setattr(shutil, "rmtree", killed)
         bench.run(until="square")
     work = bench.folder / ".store" / "work"
     assert [path.name for path in work.iterdir() if not path.name.startswith(".rubbish")] == []
@@ -209,7 +210,7 @@ def test_too_little_address_space_is_refused_before_any_work(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Under ``ulimit -v 700000``, OpenBLAS requested memory in an endless loop."""
-    monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (716_800_000, -1))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (716_800_000, -1))
     with pytest.raises(InputError, match=r"virtual memory \(ulimit -v\) is 717 MB; 2.0 GB are needed"):
         bench.run()
     assert stages_run(bench) == []
@@ -221,7 +222,7 @@ def test_the_address_space_of_all_stages_is_checked_before_any_work(
     """2.6 GB passed the first check, and g0 failed, with advice about the capture."""
     bench.run(until="count")
     bench.work_done()
-    monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (2_600_000_000, -1))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (2_600_000_000, -1))
     with pytest.raises(InputError, match=r"is 2.6 GB; 3.6 GB are needed"):
         bench.run()
     assert stages_run(bench) == []

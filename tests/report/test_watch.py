@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
 import pytest
 from report_run import FinishedRun, camera, wall
 from watched import reported, serving, working
@@ -220,7 +221,7 @@ def test_the_address_is_local_and_errors_are_reported(finished: FinishedRun) -> 
 
 def test_open_shows_the_page_in_the_browser(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
-    monkeypatch.setattr("click.launch", opened.append)
+    monkeypatch.setattr(click, "launch", opened.append)
     monkeypatch.setattr(Server, "serve_forever", lambda server: None)
     assert invoke(["watch", str(finished.folder), "--open"]) == 0
     assert invoke(["report", str(finished.folder), "--open", "-q"]) == 0

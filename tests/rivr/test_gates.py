@@ -15,6 +15,8 @@ from tiny_capture import Capture, Contrast, Sharpen, tiny_rivr, tried_rows, writ
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import read_exr
+from cleargs.models import expert as expert_module
+from cleargs.models import scorer as scorer_module
 from cleargs.progress import SilentReporter
 from cleargs.rivr.gates import GateConfig, colour_differences, rejection_reason, shifts
 from cleargs.rivr.rounds import read_row
@@ -156,8 +158,8 @@ def test_refused_repairs_stay_on_disk_and_the_render_is_taken(
         def restore(self, image: ImageF32, **options: Any) -> ImageF32:
             return np.float32(1.0) - super().restore(image, **options)
 
-    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Negative())
-    monkeypatch.setattr("cleargs.models.scorer.load_scorer", lambda spec, device: Contrast())
+    monkeypatch.setattr(expert_module, "load_expert", lambda spec, device: Negative())
+    monkeypatch.setattr(scorer_module, "load_scorer", lambda spec, device: Contrast())
     warnings: list[str] = []
     monkeypatch.setattr(SilentReporter, "warn", lambda reporter, text: warnings.append(text))
     write_capture(tmp_path)

@@ -37,6 +37,8 @@ from cleargs.formation.motion import FrameMotion
 from cleargs.formation.movement import write_movement
 from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
+from cleargs.models import expert as expert_module
+from cleargs.models import scorer as scorer_module
 from cleargs.progress import SilentReporter
 from cleargs.rivr import rounds
 from cleargs.rivr.candidates import decide, fuse
@@ -51,6 +53,7 @@ from cleargs.rivr.tables import (
     write_selection,
 )
 from cleargs.rivr.targets import load_supervision
+from cleargs.scene import viewer
 from cleargs.scene.measure import ViewPsnr, evaluate_views
 from cleargs.scene.viewer import SceneViewer
 from cleargs.splat.config import FormationConfig
@@ -78,8 +81,8 @@ def capture(tmp_path: Path, expert: Sharpen, monkeypatch: pytest.MonkeyPatch) ->
 
 def make_capture(root: Path, expert: Sharpen, monkeypatch: pytest.MonkeyPatch) -> Capture:
     scorers = {"clarity-net": Contrast(), "naturalness-stats": Darkness()}
-    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: expert)
-    monkeypatch.setattr("cleargs.models.scorer.load_scorer", lambda name, device: scorers[name])
+    monkeypatch.setattr(expert_module, "load_expert", lambda spec, device: expert)
+    monkeypatch.setattr(scorer_module, "load_scorer", lambda name, device: scorers[name])
     write_capture(root)
     return Capture(root)
 
@@ -222,7 +225,7 @@ def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It keeps its frame image, the EXR shows how it is explained, and no repair of it is drawn."""
-    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
+    monkeypatch.setattr(expert_module, "load_expert", lambda spec, device: Faithful())
     capture.use_good_scene()
     blurred = 2
     views = [
@@ -259,7 +262,7 @@ def test_layers_of_a_frame_without_an_exr_are_computed(
     formation = CaptureFormation([view], FormationConfig(), known={2: found})
     write_formation(capture.root / "g0" / "formation.parquet", formation, {2: view.weight})
     scene = SceneViewer(capture.root / "g0")
-    monkeypatch.setattr("cleargs.scene.viewer.fit_motion", None)
+    monkeypatch.setattr(viewer, "fit_motion", None)
     undone = scene.deblur(view)
     assert undone is not None and undone.formation.blur_px == 6.0
     whole, half = scene.formed_layers(view), scene.formed_layers(view, 0.5)
@@ -278,8 +281,8 @@ def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pyte
         compared.extend(view.frame_id for view in views)
         return evaluate_views(scene, views, *rest, **options)
 
-    monkeypatch.setattr("cleargs.scene.viewer.MAX_EVALUATED", 3)
-    monkeypatch.setattr("cleargs.scene.viewer.evaluate_views", recorded)
+    monkeypatch.setattr(viewer, "MAX_EVALUATED", 3)
+    monkeypatch.setattr(viewer, "evaluate_views", recorded)
     supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
     views = [view for _, view in sorted(supervision.views.items())][:7]
     assert SceneViewer(capture.root / "g0").psnr_unseen(views) is not None
@@ -288,7 +291,7 @@ def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pyte
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sharp frames are kept and supervise as frame images alone; blurred ones get repairs."""
-    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
+    monkeypatch.setattr(expert_module, "load_expert", lambda spec, device: Faithful())
     capture.use_good_scene()
     context = capture.context("rivr", keeping(), g0=PLAIN)
     result = rivr.run(context)

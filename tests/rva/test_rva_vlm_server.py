@@ -34,6 +34,7 @@ from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.progress import SilentReporter
 from cleargs.rivr.targets import load_supervision
 from cleargs.rva import tables
+from cleargs.rva.vlm import server
 from cleargs.stages.rva import RvaConfig
 
 MODEL = "Qwen/Qwen3-VL-8B-Instruct"
@@ -95,7 +96,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     for name in ("CLEARGS_VLM_URL", "CLEARGS_VLM_MODEL", "http_proxy", "HTTP_PROXY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("CLEARGS_VLM_API_KEY", KEY)
-    monkeypatch.setattr("cleargs.rva.vlm.server._PAUSE_S", 0.0)
+    monkeypatch.setattr(server, "_PAUSE_S", 0.0)
     return Bench(tmp_path)
 
 
@@ -167,7 +168,7 @@ def test_the_server_says_how_long_to_wait(bench: Bench, monkeypatch: pytest.Monk
             pauses.append(seconds)
             return False
 
-    monkeypatch.setattr("cleargs.rva.vlm.server.Event", Recorder)
+    monkeypatch.setattr(server, "Event", Recorder)
     soon = format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)
     answers = ["7", soon, "next week", None]
 
@@ -391,7 +392,7 @@ def test_from_the_command_line(
     def run() -> int:
         given = ["run", str(tmp_path / "source"), "-o", str(folder), "--workflow", str(recipe)]
         given += ["--set", "rva.evaluator=qwen3-vl", "--debug"]
-        monkeypatch.setattr("cleargs.rva.vlm.server._ATTEMPTS", 1)
+        monkeypatch.setattr(server, "_ATTEMPTS", 1)
         return invoke(given, two_stages())
 
     def failing(request: Request, before: int) -> Answer:

@@ -12,6 +12,7 @@ from cleargs.errors import InputError
 from cleargs.models.lpips import load_lpips, weights_file
 from cleargs.models.registry import model_dir
 from cleargs.progress import SilentReporter
+from cleargs.splat import texture, trainer
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.schedule import TEXTURE_EVERY, TEXTURE_FROM, Schedule
 from cleargs.splat.texture import WEIGHTS, TextureLoss, crop_of
@@ -125,14 +126,14 @@ def test_same_bits_after_a_resume(tmp_path: Path) -> None:
 
 def test_weight_zero_is_training_without_the_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with_term = trained(tmp_path / "with")
-    monkeypatch.setattr("cleargs.splat.trainer.TextureLoss", None)  # must not be called
+    monkeypatch.setattr(trainer, "TextureLoss", None)  # must not be called
     without = trained(tmp_path / "without", CONFIG.model_copy(update={"texture": 0.0}))
     assert not same(with_term, without)
     assert with_term.rows["loss"][:20].equals(without.rows["loss"][:20])
 
 
 def test_damaged_installation_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cleargs.splat.texture.WEIGHTS", tmp_path / "none.safetensors")
+    monkeypatch.setattr(texture, "WEIGHTS", tmp_path / "none.safetensors")
     with pytest.raises(InputError, match="cannot be read") as caught:
         trained(tmp_path / "run")
     assert "install ClearGS again" in caught.value.hint

@@ -23,7 +23,8 @@ from cleargs.errors import InputError
 from cleargs.models.expert import OnnxExpert, load_expert
 from cleargs.models.registry import find_model, read_receipt, verify
 from cleargs.models.scorer import LearnedScorer, MusiqScorer, patches
-from tools.convert_models import restorer, scorers
+from tools.convert_models import __main__ as convert_command
+from tools.convert_models import restorer, scorers, torch_export
 from tools.convert_models.__main__ import install_checkpoint, main
 from tools.convert_models.torch_export import declare_torchvision_operators, require
 
@@ -123,7 +124,7 @@ def test_missing_packages_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         require("json", "no_such_package", purpose="converting")
     assert "make convert-env" in caught.value.hint
 
-    monkeypatch.setattr("tools.convert_models.torch_export.find_spec", lambda name: None)
+    monkeypatch.setattr(torch_export, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="converting musiq needs pyiqa"):  # raised before the file is read
         install_checkpoint(find_model("musiq"), tmp_path, tmp_path / "none.pth", licence_accepted=True)
 
@@ -138,7 +139,7 @@ def converted(monkeypatch: pytest.MonkeyPatch) -> None:
     def convert(data: bytes, path: Path, *_: object) -> None:
         path.write_bytes(b"converted " + data)
 
-    monkeypatch.setattr("tools.convert_models.__main__.require", lambda *packages, purpose: None)
+    monkeypatch.setattr(convert_command, "require", lambda *packages, purpose: None)
     monkeypatch.setattr(restorer, "convert", convert)
 
 
