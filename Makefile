@@ -17,6 +17,7 @@
 # make oracles           install .oracles, programs of others that read exported scenes and captures in the tests
 # make cluster           install .venv-cluster, the Snakemake that runs a sheet on a cluster
 # TORCH_INDEX=URL gives pip an extra index of packages, for PyTorch's CPU build, which is much smaller.
+# INSTALL_OPTIONS=--no-compile lets Python compile the modules that it imports in place of all that are installed.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -24,7 +25,8 @@ TORCH_INDEX ?=
 
 # $(call install,ENVIRONMENT,SECTIONS OF requirements.lock,OUR PACKAGE,PACKAGES OF PYTORCH): pip checks the digest of every
 # file, except those of torch, whose builds differ by machine.
-PIP_INSTALL := python -m pip install --disable-pip-version-check
+INSTALL_OPTIONS ?=
+PIP_INSTALL := python -m pip install --disable-pip-version-check $(INSTALL_OPTIONS)
 define install
 	@echo "$(1): pip downloads Python packages, 0.4 GB without PyTorch, and shows each. PyTorch is 0.2 GB for CPUs, and some GB for GPUs."
 	awk -v wanted=" $(2) " '/^## /{take = index(wanted, " " $$2 " ")} take' requirements.lock > $(1)/requirements.txt
@@ -120,7 +122,7 @@ oracles: .oracles/stamp
 		find . -name '*.map' -delete && find webgpu/dist \
 		-name '*.node' ! -name "$$(node -p 'process.platform')-$$(node -p 'process.arch').*" -delete
 	# nerfstudio's parser, and what its import needs in addition to our own packages.
-	$(PYTHON) -m pip install --disable-pip-version-check --quiet --no-deps --target .oracles/python \
+	$(PYTHON) -m pip install --disable-pip-version-check $(INSTALL_OPTIONS) --quiet --no-deps --target .oracles/python \
 		nerfstudio==1.1.5 absl-py==2.5.1 docstring-parser==0.18.0 jaxtyping==0.3.11 msgspec==0.22.0 shtab==1.13.0 \
 		tensorboard==2.21.0 tyro==1.0.17 viser==1.1.1 wadler-lindig==0.1.8 websockets==17.4 zstandard==0.25.0
 	touch $@
@@ -136,29 +138,22 @@ cluster: .venv-cluster/stamp
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-.venv/demo.stamp: $(PINS) | .venv/bin/python
-	$(call install,.venv,base,-e .)
+# What .venv needs for a purpose: sections of requirements.lock.
+NEEDS_demo := base
+NEEDS_test := base test
+NEEDS_browser := base test browser
+NEEDS_cuda := base test cuda
+NEEDS_dev := base test dev
+NEEDS_docs := base docs
+
+.venv/%.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,$(NEEDS_$*),-e .)
 	touch $@
 
-.venv/test.stamp: $(PINS) | .venv/bin/python
-	$(call install,.venv,base test,-e .)
-	touch $@
-
-.venv/browser.stamp: $(PINS) | .venv/bin/python
-	$(call install,.venv,base test browser,-e .)
-	touch $@
-
-.venv/cuda.stamp: $(PINS) | .venv/bin/python
-	$(call install,.venv,base test cuda,-e .)
-	touch $@
-
-.venv/dev.stamp: $(PINS) | .venv/bin/python
-	$(call install,.venv,base test dev,-e .)
-	touch $@
-
-.venv/docs.stamp: $(PINS) | .venv/bin/python
-	$(call install,.venv,base docs,-e .)
-	touch $@
+# All but the GPU's at once, which is faster than one after the other.
+.venv/all.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,base test browser dev docs,-e .)
+	touch $(foreach purpose,demo test browser dev docs all,.venv/$(purpose).stamp)
 
 .venv-convert/stamp: $(PINS)
 	$(PYTHON) -m venv .venv-convert
