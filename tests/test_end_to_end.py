@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pyarrow as pa
@@ -13,11 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from plyfile import PlyData
 
+from cleargs.cli.main import invoke
 from cleargs.progress import SilentReporter
 from cleargs.stages import STAGES
 from cleargs.synth.synthetic_capture import make_capture
 
-COMMAND = [sys.executable, "-c", "from cleargs.cli.main import main; main()"]
 SETTINGS = {
     "ingest.poses": "sfm",
     "ingest.max_features": "1024",
@@ -41,22 +39,16 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def command(capture: Path, run: Path, *more: str) -> list[str]:
+def run_stages(capture: Path, run: Path, *more: str) -> None:
     settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value}")]
-    return [*COMMAND, "run", str(capture), "-o", str(run), *settings, *more]
-
-
-def finish(capture: Path, run: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(command(capture, run, *more), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done
+    assert invoke(["run", str(capture), "-o", str(run), *settings, *more]) == 0
 
 
 @pytest.fixture(scope="module")
 def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An undisturbed run on two threads."""
     run = tmp_path_factory.mktemp("finished") / "run"
-    finish(capture, run, "--threads", "2")
+    run_stages(capture, run, "--threads", "2")
     return run
 
 
@@ -93,17 +85,22 @@ def test_an_unknown_value_in_a_table_is_null_and_never_nan(finished: Path) -> No
                 assert not pc.any(pc.is_nan(column)).as_py(), (path, name)
 
 
-def test_the_same_command_again_does_nothing(capture: Path, finished: Path) -> None:
+def test_the_same_command_again_does_nothing(
+    capture: Path, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = _times(finished)
-    done = finish(capture, finished)
-    assert all(f"{stage}: started" not in done.stderr for stage in STAGES)
+    run_stages(capture, finished)
+    said = capsys.readouterr().err
+    assert all(f"{stage}: started" not in said for stage in STAGES)
     after = _times(finished)
     assert {path: after.get(path) for path in before} == before
 
 
-def test_a_setting_redoes_only_what_reads_it(capture: Path, finished: Path) -> None:
-    done = finish(capture, finished, "--set", "consolidate.distil.steps=10", "--dry-run", "--json")
-    states = {row["stage"]: row["state"] for row in json.loads(done.stdout)}
+def test_a_setting_redoes_only_what_reads_it(
+    capture: Path, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_stages(capture, finished, "--set", "consolidate.distil.steps=10", "--dry-run", "--json")
+    states = {row["stage"]: row["state"] for row in json.loads(capsys.readouterr().out)}
     assert states == {**dict.fromkeys(STAGES, "done"), "consolidate": "outdated"}
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("cleargs",),  # root modules: types, errors, io, logging
+    ("cleargs",),  # root modules
     ("cleargs.media",),
     ("cleargs.capture", "cleargs.models", "cleargs.splat"),
     ("cleargs.formation", "cleargs.rva"),
