@@ -126,6 +126,10 @@ def test_no_import_cycle() -> None:
     assert not cycles(graph())
 
 
+def test_no_module_imports_more_than_twenty_others() -> None:
+    assert {module: len(targets) for module, targets in graph().items() if len(targets) > 20} == {}
+
+
 def test_a_cycle_is_named() -> None:
     """The checks find a cycle of three modules, and an import from a higher layer."""
     circle = {"cleargs.splat.a": {"cleargs.splat.b"}, "cleargs.splat.b": {"cleargs.splat.c"}}

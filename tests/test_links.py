@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import get_args
 
 import pytest
+
+from cleargs.plugins import ExtensionPoint
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -18,6 +22,10 @@ PAGES = [
     "cleargs/models/weights/README.md",
 ]
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
+NAMED_FILE = re.compile(r"`((?:cleargs|stages|tests|tools|benchmarks|examples|workflows)/[\w./-]+\.\w+)`")
+NAMED_OBJECT = re.compile(r"`(cleargs(?:\.\w+)+)`")
+GROUPS = {f"cleargs.{point}" for point in get_args(ExtensionPoint)}
+"""Groups of entry points, which are no modules."""
 NAMED_PAGE = re.compile(r"\bdocs/[\w/-]+\.(?:md|png|svg)\b")
 
 
@@ -39,3 +47,14 @@ def test_pages_named_in_the_source_exist() -> None:
     }
     assert {name for name, _ in named} >= {"docs/settings.md", "docs/results.md"}
     assert [(name, where) for name, where in sorted(named) if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize(
+    "page", ["CONTRIBUTING.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+)
+def test_files_and_objects_named_on_a_page_exist(page: str) -> None:
+    """docs/developers.md sent its readers to a class that did not exist."""
+    text = (ROOT / page).read_text("utf-8")
+    assert [name for name in NAMED_FILE.findall(text) if not (ROOT / name).exists()] == []
+    for name in set(NAMED_OBJECT.findall(text)) - GROUPS:
+        resolve_name(name)

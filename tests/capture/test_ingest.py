@@ -105,7 +105,7 @@ def test_observations_point_at_what_they_see(made: Ingested) -> None:
     assert np.abs(picture[y, x].astype(int) - rgb).mean() < 15
 
 
-@pytest.mark.parametrize(("scale", "shift"), [(1.0, 1e6), (1e4, 0.0), (1e-4, 0.0)])
+@pytest.mark.parametrize(("scale", "shift"), [(1e4, 1e10), (1e-4, 0.0)])
 def test_the_input_world_does_not_matter(
     posed: Path,
     made: Ingested,
