@@ -241,7 +241,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a short video, and with the names that the pages use."""
     folder = tmp_path_factory.mktemp("docs")
     clip = folder / "clip"
-    make_capture(clip, "sharp", frames=13, width=240, height=136, seed=3, reporter=SilentReporter())
+    make_capture(clip, "sharp", frames=13, width=160, height=90, seed=3, reporter=SilentReporter())
     frames = [read_rgb(path) for path in sorted((clip / "images").iterdir())]
     write_video(folder / "walk.mp4", frames, FPS)
     return folder
@@ -322,6 +322,7 @@ def test_the_first_example_of_the_library_runs(place: Path, monkeypatch: pytest.
     make_capture(Path("demo/capture"), "mixed", **size, seed=0, reporter=SilentReporter())
     assert invoke(["run", "demo/capture", "-o", "demo/run", *shlex.split(TINY["run"])]) == 0
     tiny = {"g0.steps": 20, "g0.min_points": 300, "g0.budget": 400}
+    tiny |= {f"{stage}.distil.steps": 5 for stage in ("rivr", "consolidate")}  # as in `TINY`
     for source in ("walk.mp4", "demo/capture"):
         code = first.replace('"walk.mp4"', f'"{source}"').replace("seconds=6", "seconds=0.2")
         code = code.replace('quality="draft"', f'quality="draft", set={tiny}')
