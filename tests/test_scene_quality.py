@@ -10,21 +10,21 @@ import cleargs as cg
 from cleargs.evaluate.config import EvalOptions
 
 SETTINGS = {
-    "g0.steps": 400,
-    "g0.min_points": 4000,
-    "g0.budget": 8000,
+    "g0.steps": 300,
+    "g0.min_points": 3000,
+    "g0.budget": 5000,
     "rivr.rounds": 1,
     "rivr.distil.steps": 40,
     "consolidate.distil.steps": 40,
 }
 STORED = {
     "mixed": {
-        "observed": {"g0": 32.01, "rivr": 32.19, "consolidate": 32.03},
-        "novel": {"g0": 30.84, "rivr": 30.99, "consolidate": 30.85},
+        "observed": {"g0": 30.94, "rivr": 31.04, "consolidate": 31.06},
+        "novel": {"g0": 29.64, "rivr": 29.68, "consolidate": 29.69},
     },
     "gs2e-medium": {
-        "observed": {"g0": 35.72, "rivr": 35.83, "consolidate": 35.87},
-        "novel": {"g0": 33.95, "rivr": 34.03, "consolidate": 34.05},
+        "observed": {"g0": 33.86, "rivr": 34.05, "consolidate": 34.20},
+        "novel": {"g0": 31.93, "rivr": 32.05, "consolidate": 32.13},
     },
 }
 """Protocol -> views -> stage -> PSNR of its scene at the true sharp views, dB. Store new figures in
@@ -37,7 +37,7 @@ TOLERANCE_DB = 0.3
 @pytest.mark.parametrize("protocol", STORED)
 def test_scenes_are_as_good_as_they_were(protocol: str, tmp_path: Path) -> None:
     capture, run = tmp_path / "room", tmp_path / "run"
-    cg.make_capture(capture, protocol, frames=10, width=192, height=108, seed=3)
+    cg.make_capture(capture, protocol, frames=8, width=160, height=90, seed=3)
     cg.run(capture, run, set=SETTINGS)
     options = EvalOptions(lpips=(), scorers=())
     found = {
