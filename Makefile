@@ -138,7 +138,7 @@ cluster: .venv-cluster/stamp
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-# What .venv needs for a purpose: sections of requirements.lock.
+# Sections of requirements.lock that .venv needs, by purpose.
 NEEDS_demo := base
 NEEDS_test := base test
 NEEDS_browser := base test browser

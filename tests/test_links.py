@@ -25,7 +25,7 @@ LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
 NAMED_FILE = re.compile(r"`((?:cleargs|stages|tests|tools|benchmarks|examples|workflows)/[\w./-]+\.\w+)`")
 NAMED_OBJECT = re.compile(r"`(cleargs(?:\.\w+)+)`")
 GROUPS = {f"cleargs.{point}" for point in get_args(ExtensionPoint)}
-"""Groups of entry points, which are no modules."""
+"""Groups of entry points: names without a module."""
 NAMED_PAGE = re.compile(r"\bdocs/[\w/-]+\.(?:md|png|svg)\b")
 
 
