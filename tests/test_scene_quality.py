@@ -17,40 +17,35 @@ SETTINGS = {
     "rivr.distil.steps": 40,
     "consolidate.distil.steps": 40,
 }
+SCORER = "clarity-net"
 STORED = {
-    "mixed": {
-        "observed": {"g0": 30.94, "rivr": 31.04, "consolidate": 31.06},
-        "novel": {"g0": 29.64, "rivr": 29.68, "consolidate": 29.69},
-    },
-    "gs2e-medium": {
-        "observed": {"g0": 33.86, "rivr": 34.05, "consolidate": 34.20},
-        "novel": {"g0": 31.93, "rivr": 32.05, "consolidate": 32.13},
-    },
+    ("mixed", "observed"): {"g0": (30.94, 90.4), "rivr": (31.04, 90.6), "consolidate": (31.06, 90.8)},
+    ("mixed", "novel"): {"g0": (29.64, 90.2), "rivr": (29.68, 90.4), "consolidate": (29.69, 90.6)},
+    ("gs2e-medium", "observed"): {"g0": (33.86, 85.1), "rivr": (34.05, 85.1), "consolidate": (34.20, 85.4)},
+    ("gs2e-medium", "novel"): {"g0": (31.93, 84.7), "rivr": (32.05, 84.8), "consolidate": (32.13, 85.0)},
 }
-"""Protocol -> views -> stage -> PSNR of its scene at the true sharp views, dB. Store new figures in
-the commit that changes a result, and give both in its body."""
-TOLERANCE_DB = 0.3
+"""Protocol and views -> stage -> PSNR, dB, of its scene at the true sharp views, and the score of its
+renders, which predicts their LPIPS (whose own network is not shipped). Store new figures in the commit that
+changes a result, and give both in its body."""
+TOLERANCE_DB, TOLERANCE_SCORE = 0.3, 1.0
 """Other processors round otherwise, which changes the figures by less than 0.1 dB."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("protocol", STORED)
+@pytest.mark.parametrize("protocol", ["mixed", "gs2e-medium"])
 def test_scenes_are_as_good_as_they_were(protocol: str, tmp_path: Path) -> None:
     capture, run = tmp_path / "room", tmp_path / "run"
     cg.make_capture(capture, protocol, frames=8, width=160, height=90, seed=3)
     cg.run(capture, run, set=SETTINGS)
-    options = EvalOptions(lpips=(), scorers=())
-    found = {
-        views: {
-            stage: round(
-                cg.evaluate_scene(run, capture / "truth" / views, stage=stage, options=options).means["psnr"],
-                2,
+    options = EvalOptions(lpips=(), scorers=(SCORER,))
+    stored, found = {}, {}
+    for views in ("observed", "novel"):
+        for stage, (psnr, score) in STORED[protocol, views].items():
+            reference = capture / "truth" / views
+            means = cg.evaluate_scene(run, reference, stage=stage, options=options).means
+            found[views, stage] = round(means["psnr"], 2), round(means[SCORER], 1)
+            stored[views, stage] = (
+                pytest.approx(psnr, abs=TOLERANCE_DB),
+                pytest.approx(score, abs=TOLERANCE_SCORE),
             )
-            for stage in stages
-        }
-        for views, stages in STORED[protocol].items()
-    }
-    assert found == {
-        views: {stage: pytest.approx(value, abs=TOLERANCE_DB) for stage, value in stages.items()}
-        for views, stages in STORED[protocol].items()
-    }
+    assert found == stored
