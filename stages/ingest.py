@@ -160,13 +160,8 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         f"{len(capture.frames)} of {capture.n_available} frames ({capture.kind}), "
         f"long side at most {config.max_size} px"
     )
-    for note in capture.notes:
+    for note in capture.remarks:
         reporter.warn(note)
-    if capture.hdr is not None:
-        reporter.warn(
-            f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
-            "highlights compressed; record in SDR where colours must be exact"
-        )
     few = len(capture.frames) < FEW_FRAMES
     if few and config.max_frames >= GOOD_FRAMES:  # a quick test, such as the demo, asks for fewer
         reporter.warn(

@@ -60,7 +60,18 @@ class Capture:
     told: str = ""
     """One line on what is read from a folder and what is left out."""
     notes: tuple[str, ...] = ()
-    """Remarks on how the input was read, which are shown as warnings."""
+    """Remarks on how the input was read."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Return `notes`, and one on the colours of an HDR video. All are shown as warnings."""
+        if self.hdr is None:
+            return self.notes
+        toned = (
+            f"HDR video ({self.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
+            "highlights compressed; record in SDR where colours must be exact"
+        )
+        return *self.notes, toned
 
     @property
     def has_clock(self) -> bool:

@@ -215,7 +215,7 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     previews = _previews(images, headers, root, few=not videos)
     left_out[PREVIEWS] = [*previews, *small]
     images = _without(images, previews)
-    products = [path for path in images if PRODUCT_NAME.fullmatch(path.stem)]
+    products = [path for path in images if PRODUCT_NAME.fullmatch(path.stem) or _is_texture(path)]
     left_out[PRODUCTS] = products if len(products) <= _FEW * (len(images) - len(products)) else []
     images = _without(images, left_out[PRODUCTS])
     views = second_views(images, root)
@@ -321,6 +321,11 @@ def _by_channels(headers: Mapping[Path, Header | None]) -> tuple[list[Path], lis
     if len(colour) >= FEWEST or not (grey or deep):
         return colour, deep, grey
     return ([*colour, *grey], deep, []) if grey else ([*colour, *deep], [], [])
+
+
+def _is_texture(path: Path) -> bool:
+    """Return True if a mesh has the name of the picture, as KIRI Engine and Metashape export them."""
+    return any(path.with_suffix(end).is_file() for end in (".mtl", ".obj", ".fbx", ".dae"))
 
 
 def _other_bands(images: Sequence[Path]) -> list[Path]:

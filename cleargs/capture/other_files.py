@@ -11,6 +11,10 @@ from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 _GIVE = "give a video, or a folder of images"
 _SCENES = "cleargs export, render and eval read scenes; cleargs run makes one from a video or images"
 
+_MODELS = (
+    ".ply .splat .spz .sog .ksplat .glb .gltf .obj .fbx .dae .stl .abc .usd .usda .usdc .usdz .3mf .wrl .x3d"
+)
+
 _KINDS = (
     ("a file of a photo editor", ".xmp .dop .pp3 .on1 .cos", _GIVE),
     ("a list of edits of an iPhone photograph", ".aae", _GIVE),
@@ -21,9 +25,19 @@ _KINDS = (
     ("a document", ".pdf .html .md .doc .docx .xlsx .pptx", _GIVE),
     ("a sound", ".wav .mp3 .m4a .aac .flac", _GIVE),
     ("an archive", ".zip .tar .gz .tgz .xz .bz2 .zst .7z .rar", "unpack it, and give its folder"),
-    ("a 3D scene or model", ".ply .splat .spz .sog .glb .gltf .obj .fbx .stl .usd .usdc .usdz", _SCENES),
+    ("a 3D scene or model", _MODELS, _SCENES),
     ("a laser scan", ".las .laz .e57 .pts .ptx", _GIVE),
-    ("a recording of a camera", ".bag .db3 .mcap .svo .r3d .klg .sens", "export its pictures into a folder"),
+    (
+        "a recording of a camera",
+        ".bag .db3 .mcap .svo .svo2 .vrs .r3d .klg .sens",
+        "export its pictures into a folder",
+    ),
+    ("a raw video", ".braw .mlv .crm .ari", "export it as MP4 with the camera's program"),
+    (
+        "a project or an export of another program",
+        ".psx .psz .rcproj .p4d .mg .sfm .psht .blend .nvm .out .lrcat .prproj .drp .pcd",
+        _GIVE,
+    ),
     (
         "a recording of a 360 degree camera",
         ".insv .insp .360",
@@ -44,11 +58,11 @@ def kind_of(path: Path) -> tuple[str, str] | None:
     return next(((kind, hint) for kind, ends, hint in _KINDS if path.suffix.lower() in ends.split()), None)
 
 
-def remedy_in(folder: Path) -> str:
-    """Return a hint for a ``folder`` without images, which names a file in it that must be converted."""
+def remedy_in(folder: Path, otherwise: str) -> str:
+    """Return a hint for a ``folder`` with too few images: a file in it that must be converted, if any."""
     files = [(path.name, kind_of(path)) for path in sorted(folder.iterdir()) if path.is_file()]
     named = (f"{name} is {kind[0]}: {kind[1]}" for name, kind in files if kind and kind[1] != _GIVE)
-    return next(named, "give a video, a folder of images, a COLMAP project or transforms.json")
+    return next(named, otherwise)
 
 
 def refused(path: Path, kind: str, hint: str) -> InputError:

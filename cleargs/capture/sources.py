@@ -10,7 +10,7 @@ from cleargs.capture.capture import Capture, External, Layout
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.contents import media_files
 from cleargs.capture.layouts import colmap, images, llff, rgbd, transforms, video
-from cleargs.capture.other_files import is_small_copy, kind_of, refused
+from cleargs.capture.other_files import is_small_copy, kind_of, refused, remedy_in
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.plugins import load_plugin
@@ -29,7 +29,8 @@ _TABLES = frozenset(
 _LISTED = "transforms.json transforms_train.json transforms_test.json transforms_val.json poses_bounds.npy"
 _TRACKED = "camera_matrix.csv odometry.csv metadata.json rgb.txt groundtruth.txt"
 _LISTS = frozenset([*_LISTED.split(), *_TRACKED.split(), "project.ini"])
-_MODELS, _IMAGES = frozenset({"sparse", "colmap", "distorted"}), frozenset({"images", "rgb", "color"})
+_MODELS = frozenset({"distorted", *(part for place in colmap.PLACES for part in place.split("/"))})
+_IMAGES = frozenset({"images", "rgb", "color"})
 """Files and folders of a capture that may be given in its place."""
 
 
@@ -91,10 +92,11 @@ def _opened(source: Path, config: CaptureConfig) -> Capture:
             f"{source} is not a video: ingest.start and ingest.end choose a part of a video",
             hint="leave them out, or give the video",
         )
-    if len(capture.frames) < MIN_FRAMES:
+    if (count := len(capture.frames)) < MIN_FRAMES:
+        more = "give more images, record longer, or raise ingest.fps"
         raise InputError(
-            f"{source} gives {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",
-            hint="give more images, record longer, or raise ingest.fps",
+            f"{source} gives {count} frame{'s' * (count != 1)}; a scene needs at least {MIN_FRAMES}",
+            hint=remedy_in(source, more) if source.is_dir() else more,
         )
     return replace(capture, frame_rate=config.frame_rate)
 

@@ -13,7 +13,8 @@ import click
 from click.core import ParameterSource
 
 import cleargs
-from cleargs.capture.sources import whole_capture
+from cleargs.capture.config import CaptureConfig
+from cleargs.capture.sources import open_capture, whole_capture
 from cleargs.cli.commands import as_called
 from cleargs.cli.common import (
     DONE_IN_PART,
@@ -183,6 +184,10 @@ def run(
             runner = Runner(dag, settings, opened, threads, reporter)
             if dry_run:
                 plans = runner.plan(until, tuple(dag.check(name) for name in force))
+                reading = settings.config.effective.get("ingest")
+                if isinstance(reading, CaptureConfig) and plans[0].estimate is not None:
+                    for note in open_capture(source, reading).remarks:
+                        reporter.warn(note)
                 print_plans(_with_outdated(plans, settings.folder, dag), as_json, settings.stages(dag))
                 return 0
             log(

@@ -11,7 +11,7 @@ import pyarrow as pa
 from torch import Tensor
 
 from cleargs.media.image import write_rgb
-from cleargs.progress import PREVIEW, Rate, Reporter, Task
+from cleargs.progress import PREVIEW, Reporter, Task
 from cleargs.splat import compilation
 from cleargs.splat.backend import backend_for
 from cleargs.splat.interruption import deferred_sigterm
@@ -66,7 +66,7 @@ def run(
         deferred_sigterm() as terminated,
         reporter.task(label, total=trainer.length) as task,
     ):
-        fractions, rate = trainer.work_fractions(), Rate()
+        fractions = trainer.work_fractions()
         next_save = 0.0
         while trainer.done < trainer.length:
             trainer.step()
@@ -77,7 +77,7 @@ def run(
                 and now >= next_save
             )
             if trainer.done % NOTE_INTERVAL == 0:
-                _show(trainer, task, fractions, rate)
+                _show(trainer, task, fractions)
             if due or trainer.done % _CHECK_INTERVAL == 0:
                 trainer.check_finite()
             if due:
@@ -88,20 +88,18 @@ def run(
             if stopped:
                 raise KeyboardInterrupt
         trainer.check_finite()
-        _show(trainer, task, fractions, rate)
+        _show(trainer, task, fractions)
     state = {k: tensor.cpu() for k, tensor in trainer.state().items() if not k.startswith("parameter.")}
     return Trained(trainer.scene.to("cpu"), trainer.rows(round), state)
 
 
-def _show(trainer: Trainer, task: Task, fractions: Sequence[float], rate: Rate) -> None:
-    """Show iterations per second, PSNR and number of Gaussians in the progress bar.
+def _show(trainer: Trainer, task: Task, fractions: Sequence[float]) -> None:
+    """Show PSNR and number of Gaussians next to the steps done.
 
-    The rate starts with the first call, because earlier steps may include the compilation of kernels.
+    Steps per second would not agree with the time left: later steps have more Gaussians, and take longer.
     """
-    words = [f"training PSNR {trainer.last_psnr:.2f} dB", f"{trainer.scene.gaussians.num} Gaussians"]
-    if (steps := rate.per_second(trainer.done)) is not None:
-        words.insert(0, f"{steps:.1f} it/s")
-    task.update(done=trainer.done, note=", ".join(words), share=fractions[trainer.done])
+    note = f"training PSNR {trainer.last_psnr:.2f} dB, {trainer.scene.gaussians.num} Gaussians"
+    task.update(done=trainer.done, note=note, share=fractions[trainer.done])
 
 
 def _next_save(begun: float, ended: float) -> float:

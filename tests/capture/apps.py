@@ -475,3 +475,99 @@ def raw_and_jpeg(root: Path, pictures: Pictures, poses: Poses) -> None:
         (root / f"{name[1]}.dng").write_bytes(b"II*\0")
         save(root / f"sam_vis/{name[0]}_vis.png", picture // 2)
     save(root / "DSC0002 2.jpg", pictures[2])
+
+
+def euroc(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """EuRoC MAV: two grey cameras, and lists of times."""
+    for index, picture in enumerate(pictures):
+        for camera in (0, 1):
+            name = f"mav0/cam{camera}/data/{1403636579763555584 + 50000000 * index}.png"
+            save(root / name, cv2.cvtColor(np.roll(picture, 9 * camera, 1), cv2.COLOR_BGR2GRAY))
+    (root / "mav0/cam0/data.csv").write_text("#timestamp [ns],filename")
+    (root / "mav0/cam0/sensor.yaml").write_text("camera_model: pinhole")
+
+
+def kitti(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """KITTI odometry: two grey and two colour cameras."""
+    for index, picture in enumerate(pictures):
+        for camera in range(4):
+            grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+            seen = grey if camera < 2 else np.roll(picture, 9 * camera, 1)
+            save(root / f"image_{camera}/{index:06d}.png", seen)
+    (root / "calib.txt").write_text("P0: 1 0 0 0")
+
+
+def replica(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Replica, as NICE-SLAM rendered it."""
+    for index, picture in enumerate(pictures):
+        save(root / f"results/frame{index:06d}.jpg", picture)
+        depth(root / f"results/depth{index:06d}.png")
+    (root / "traj.txt").write_text("\n".join(words(*pose.ravel()) for pose in poses))
+
+
+def hypernerf(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Nerfies and HyperNeRF: the pictures in four sizes."""
+    for index, picture in enumerate(pictures):
+        for factor in (1, 2, 4, 8):
+            small = cv2.resize(picture, (WIDTH // factor, HEIGHT // factor))
+            save(root / f"rgb/{factor}x/{index + 1:06d}.png", small)
+    (root / "dataset.json").write_text("{}")
+
+
+def arkit_scenes(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """ARKitScenes: a lens in two sizes, another lens, depth and confidence."""
+    for index, picture in enumerate(pictures):
+        name = f"40753679_{6791 + index / 10:.3f}.png"
+        save(root / "vga_wide" / name, picture)
+        save(root / "lowres_wide" / name, cv2.resize(picture, (WIDTH // 2, HEIGHT // 2)))
+        save(root / "ultrawide" / name, picture[::-1])
+        depth(root / "lowres_depth" / name)
+        confidence(root / "confidence" / name)
+
+
+def opensfm(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """OpenSfM and ODM: pictures that they undistorted, and those of their reports."""
+    for index, picture in enumerate(pictures):
+        save(root / f"images/{index:04d}.jpg", picture)
+        save(root / f"undistorted/images/{index:04d}.jpg", picture)
+        save(root / f"opensfm/undistorted/images/{index:04d}.tif", picture)
+    save(root / "stats/topview.png", pictures[0][:100])
+    (root / "reconstruction.json").write_text("[]")
+
+
+def kiri(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """KIRI Engine: the photographs, and the mesh with its texture."""
+    for index, picture in enumerate(pictures):
+        save(root / f"photos/{index + 1}.jpg", picture)
+    save(root / "3DModel.jpg", np.vstack([np.hstack(pictures[:2]), np.hstack(pictures[2:4])]))
+    for end in ("obj", "mtl"):
+        (root / f"3DModel.{end}").write_text("")
+
+
+def eth3d(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """ETH3D's photographs, with COLMAP's text files in a folder of another name."""
+    for index, picture in enumerate(pictures):
+        save(root / f"images/dslr_images_undistorted/DSC_{index:04d}.JPG", picture)
+    names = [f"dslr_images_undistorted/DSC_{index:04d}.JPG" for index in range(len(pictures))]
+    colmap_text(root / "dslr_calibration_undistorted", names, poses)
+
+
+def scannetpp_dslr(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """ScanNet++, the part of the camera, with COLMAP's text files in colmap/."""
+    for index, picture in enumerate(pictures):
+        save(root / f"resized_images/DSC{index:05d}.JPG", picture)
+    colmap_text(root / "colmap", [f"DSC{index:05d}.JPG" for index in range(len(pictures))], poses)
+
+
+def colmap_text(folder: Path, names: Sequence[str], poses: Poses) -> None:
+    """Cameras and poses, without points."""
+    folder.mkdir(parents=True)
+    camera = words(1, "PINHOLE", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    (folder / "cameras.txt").write_text(camera + "\n")
+    lines = []
+    for index, (name, pose) in enumerate(zip(names, poses, strict=True)):
+        to_camera = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(to_camera[:3, :3]).as_quat().tolist()
+        lines += [words(index + 1, w, x, y, z, *to_camera[:3, 3].tolist(), 1, name), ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "points3D.txt").write_text("")

@@ -264,6 +264,8 @@ def test_a_mask_of_one_pixel(posed: Path, ingest: Ingest) -> None:
         ("IMG_1.DNG", None, "a raw or other picture", "convert it to JPEG or PNG"),
         ("room.zip", None, "an archive", "unpack it"),
         ("scene.ply", None, "a 3D scene or model", "cleargs export, render and eval"),
+        ("room.psx", None, "a project or an export of another program", "give a video, or a folder"),
+        ("room.vrs", None, "a recording of a camera", "export its pictures"),
     ],
 )
 def test_a_file_of_another_kind_is_named(

@@ -93,6 +93,13 @@ READ: dict[str, tuple[apps.Writer, int, str]] = {
     "Matterport": (apps.matterport, 10, "6 pictures of panoramas from one spot (matterport_skybox_images/)"),
     "raw": (apps.raw_and_jpeg, 10, "10 photographs; left out: 21 second pictures"),
     "Pixel": (apps.pixel_portraits, 10, "left out: 10 second pictures"),
+    "EuRoC": (apps.euroc, 20, "20 photographs (mav0/cam0/data/ 10, mav0/cam1/data/ 10)"),
+    "KITTI": (apps.kitti, 20, "left out: 20 pictures of one channel (image_0/ 10, image_1/ 10)"),
+    "Replica": (apps.replica, 10, "10 photographs (results/); left out: 10 depth maps (results/)"),
+    "HyperNeRF": (apps.hypernerf, 10, "10 photographs (rgb/1x/); left out: 30 second pictures"),
+    "ARKitScenes": (apps.arkit_scenes, 20, "20 photographs (ultrawide/ 10, vga_wide/ 10)"),
+    "OpenSfM": (apps.opensfm, 10, "10 photographs (images/); left out: 21 pictures outside images/"),
+    "KIRI": (apps.kiri, 10, "10 photographs (photos/); left out: 1 picture named as a texture"),
     "previews": (apps.previews_at_the_top, 10, "2 previews (cover_0.jpg, cover_1.jpg)"),
 }
 
@@ -128,6 +135,19 @@ def test_poses_of_apps_are_those_planted(tmp_path: Path, frames: Frames, app: st
         assert np.allclose(frame.pose.translation, world_to_camera[:3, 3], atol=1e-6)
         if app not in ("TUM", "7-Scenes"):
             assert frame.camera is not None and np.allclose(frame.camera.focal, FOCAL)
+
+
+@pytest.mark.parametrize(
+    ("app", "folder"), [(apps.eth3d, "dslr_calibration_undistorted"), (apps.scannetpp_dslr, "colmap")]
+)
+def test_models_in_folders_of_data_sets(
+    tmp_path: Path, frames: Frames, app: apps.Writer, folder: str
+) -> None:
+    root = write(app, tmp_path / "capture", frames)
+    capture = open_capture(root, IngestConfig())
+    assert capture.kind == "colmap" and [frame.pose is None for frame in capture.frames] == [False] * 10
+    assert f"10 with a pose in the COLMAP model of {folder}/" in capture.told
+    assert whole_capture(root / folder / "images.txt") == root
 
 
 @pytest.mark.parametrize("app", ["Stray Scanner", "Polycam", "7-Scenes"])
@@ -439,6 +459,21 @@ def test_the_sharp_portraits_and_the_first_band_are_taken(tmp_path: Path, frames
     assert any("--only takes another" in note for note in bands.notes)
     third = open_capture(tmp_path / "drone", IngestConfig(only="*_3.tif"))
     assert len(third.frames) == 10 and all(frame.name.endswith("_3.tif") for frame in third.frames)
+
+
+def test_a_preview_next_to_a_scan_names_the_scan(tmp_path: Path, frames: Frames) -> None:
+    cv2.imwrite(str(tmp_path / "preview.jpg"), frames[0][1])
+    (tmp_path / "scan.ply").write_text("ply")
+    with pytest.raises(InputError, match="gives 1 frame; a scene needs") as refused:
+        open_capture(tmp_path, IngestConfig())
+    assert "scan.ply is a 3D scene or model" in str(refused.value.hint)
+
+
+def test_a_dry_run_gives_the_warnings(images: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (images / "a.DNG").write_bytes(b"II*\0")
+    assert invoke(["run", str(images), "-o", str(images.parent / "run"), "--dry-run"]) == 0
+    told = capsys.readouterr().err
+    assert "warning: left out: 1 raw or other picture (a.DNG); convert them to JPEG or PNG" in told
 
 
 def test_panoramas_alone_are_taken(tmp_path: Path, frames: Frames) -> None:

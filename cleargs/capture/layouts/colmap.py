@@ -29,6 +29,15 @@ from cleargs.capture.model_text import image_lines
 from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, open_regular
 
+PLACES = (
+    "sparse",
+    "colmap/sparse",
+    "colmap",  # ScanNet++
+    "dslr_calibration_undistorted",  # ETH3D
+    "dslr_calibration_jpg",
+)
+"""Folders of sparse models in a capture."""
+
 
 def detect(source: Path, config: CaptureConfig) -> bool:
     return config.uses_poses and bool(_models(source))
@@ -118,7 +127,7 @@ def _models(root: Path) -> dict[Path, int]:
     Several programs write the model next to the images, or ``images`` and ``cameras`` alone.
     """
     folders: list[Path] = []
-    for sparse in (root / "sparse", root / "colmap" / "sparse"):
+    for sparse in map(root.joinpath, PLACES):
         if sparse.is_dir():
             folders += [*sorted(path for path in sparse.iterdir() if path.name.isdecimal()), sparse]
     found: dict[Path, int] = {}

@@ -27,7 +27,10 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     contents = contents_of(source, config)
     frames = contents.frames()
     if not frames:
-        raise InputError(f"{source} holds no images, no video and no transforms.json", hint=remedy_in(source))
+        raise InputError(
+            f"{source} holds no images, no video and no transforms.json",
+            hint=remedy_in(source, "give a video, a folder of images, a COLMAP project or transforms.json"),
+        )
     patterns = [*(f"*/{name}" for name in LISTS), "dense/*/sparse"] if config.uses_poses else []
     nested = [path for pattern in patterns for path in sorted(source.glob(pattern))]
     notes = [f"poses in {path} are not read: give {path.parent} as the input" for path in nested[:1]]
