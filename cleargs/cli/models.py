@@ -6,10 +6,13 @@ from pathlib import Path
 
 import click
 
-from cleargs.cli.common import FOLDER, answer, json_option
+from cleargs.cli.common import FOLDER, answer, json_option, print_json
+from cleargs.cli.terminal_table import print_table
 from cleargs.errors import InputError
 from cleargs.models.registry import Source, find_model, load_registry, model_dir, state
 from cleargs.models.registry import verify as verify_model
+
+_TEXT = "what it does, and where it is from"
 
 _dir_option = click.option(
     "--dir",
@@ -34,17 +37,21 @@ def list_models(directory: Path | None, as_json: bool) -> None:
     folder = directory or model_dir()
     entries = load_registry()
     found = [entry.model_dump(mode="json") | {"state": state(entry, folder)} for entry in entries]
-    lines = []
+    rows = []
     for entry in entries:
-        lines.append(f"{entry.name:<18} {state(entry, folder):<14} {entry.task}")
+        rows.append([entry.name, state(entry, folder), entry.task])
         if entry.source is not None:
             facts = [entry.source.label, _size(entry.source), entry.licence]
             if not entry.commercial:
                 facts.append("NOT for commercial use")
             if not entry.source.verified:
                 facts.append("unverified: its publisher gives no full digest")
-            lines.append(f"{'':<33} {', '.join(fact for fact in facts if fact)}")
-    answer(as_json, found, *lines, f"folder: {folder}")
+            rows.append(["", "", ", ".join(fact for fact in facts if fact)])
+    if as_json:
+        print_json(found)
+        return
+    print_table(rows, "model", "state", _TEXT, wraps=_TEXT)
+    click.echo(f"folder: {folder}")
 
 
 @models.command()

@@ -31,10 +31,17 @@ def print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", w
         column.min_width = 14 if column.header == wraps else None
     for row in rows:
         table.add_row(*row)
-    least = [
-        max(len(part) for text in cells for part in ([text] if column.no_wrap else text.split() or [""]))
-        for column, cells in zip(table.columns, zip_longest(*rows, columns, fillvalue=""), strict=True)
-    ]
-    least = [max(width, column.min_width or 0) for width, column in zip(least, table.columns, strict=True)]
-    console.width = max(console.width, sum(least) + gap[1] * (len(least) - 1))
+    least = 0
+    for column, cells in zip(table.columns, zip_longest(*rows, columns, fillvalue=""), strict=True):
+        column.no_wrap |= all(len(text.split()) < 2 for text in cells[:-1])
+        parts = (part for text in cells for part in ([text] if column.no_wrap else _words(text)))
+        column.min_width = max(column.min_width or 0, *map(len, parts))
+        least += column.min_width
+    console.width = max(console.width, least + gap[1] * (len(table.columns) - 1))
     console.print(table)
+
+
+def _words(text: str) -> list[str]:
+    """Return the words of ``text``, each as far from the left as the first one."""
+    indent = len(text) - len(text.lstrip())
+    return [" " * indent + word for word in text.split()] or [""]

@@ -229,3 +229,6 @@ def test_show_wraps_labels_and_cuts_no_value(
     )
     out = capsys.readouterr().out
     assert all(word in out for word in ("complete", "1234.5", "12345.6", "frames", "150,", "pose"))
+    print_table([["  triangulating", "0.6", "#" * 20]], "part of the time", "seconds", "")
+    out = capsys.readouterr().out
+    assert "  triangulating" in out and "#" * 20 in out, out

