@@ -17,12 +17,11 @@ from cleargs.base_model import FrozenModel
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.own_files import nodes_below
+from cleargs.pipeline.run_file import PROGRESS_FILE
 from cleargs.pipeline.store import writer_is_alive
 from cleargs.progress import COMPILING, PREVIEW, BothTasks, CountedTask, Reporter, Task
 from cleargs.safe_io import FAULTS, read_json
 from cleargs.timing import timed
-
-PROGRESS_FILE = ".at_work.json"
 
 MAX_BYTES = 16_384
 """Maximum size of a progress file that is read."""

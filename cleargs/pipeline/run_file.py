@@ -31,7 +31,10 @@ RUN_LOG = "run.log"
 LOCK = ".lock"
 """Lock file of the process that works in the run folder."""
 
-OWN_NAMES = (RUN_FILE, LOCK, RUN_LOG, EVAL, ".at_work.json", VIEWS, "report", "report.html")
+PROGRESS_FILE = ".at_work.json"
+"""File with the progress of the stage at work. It stays if the stage stops before its end."""
+
+OWN_NAMES = (RUN_FILE, LOCK, RUN_LOG, EVAL, PROGRESS_FILE, VIEWS, "report", "report.html")
 """Files and folders in a run that ClearGS reads or writes, apart from those of the stages."""
 
 HEADER = """\
@@ -148,14 +151,16 @@ def read_metadata(folder: Path) -> RunMetadata:
 def require_store(folder: Path, metadata: RunMetadata) -> None:
     """Raise StoreError if results of the run in ``folder`` were in a store that is gone, as its disk may be.
 
-    Otherwise all stages would run again, into the empty folder where the disk was.
+    Otherwise all stages would run again, into the empty folder where the disk was. A stage that stopped
+    before its end had a checkpoint there.
     """
     store = metadata.store
     if store is None or (store / ROOTS).is_dir():
         return
-    for link in folder.iterdir():
-        key = copied_key(link)
-        if (link.is_symlink() and not link.exists()) or (key and not (store / link.name / key).exists()):
+    for path in folder.iterdir():
+        key = copied_key(path)
+        lost = (path.is_symlink() and not path.exists()) or (key and not (store / path.name / key).exists())
+        if lost or path.name == PROGRESS_FILE:
             raise StoreError(
                 f"the store {store} of the run {folder} is gone",
                 hint="connect its disk; to begin again in another one: cleargs run INPUT -o RUN --store X",

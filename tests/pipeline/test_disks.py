@@ -13,7 +13,7 @@ import pytest
 from toy import Bench
 
 from cleargs.cli.main import invoke
-from cleargs.errors import StoreError
+from cleargs.errors import StageError, StoreError
 from cleargs.pipeline import runner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.session import opened_store, resolve_run
@@ -129,6 +129,20 @@ def test_a_store_that_is_gone_is_named(bench: Bench, tmp_path: Path, mount_point
     shutil.rmtree(disk, ignore_errors=True)
     (tmp_path / "unplugged").rename(disk)
     assert [outcome.how for outcome in bench.run(store=disk / "store")] == ["found"] * 3
+
+
+def test_a_store_that_went_during_the_first_stage_is_named(bench: Bench, tmp_path: Path) -> None:
+    """The next try computed into the empty mount point."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    shutil.rmtree(bench.capture)
+    bench.capture.write_text("no folder, so that the stage fails")
+    with pytest.raises(StageError):
+        bench.run(store=disk / "store")
+    disk.rename(tmp_path / "unplugged")
+    disk.mkdir()
+    with pytest.raises(StoreError, match="is gone"):
+        read_run_file(bench.folder, bench.dag)
 
 
 def test_a_store_without_results_is_made(bench: Bench, tmp_path: Path) -> None:

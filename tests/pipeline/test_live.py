@@ -15,14 +15,8 @@ from toy import Bench
 from cleargs.cli.main import invoke
 from cleargs.errors import StoreError
 from cleargs.pipeline import live
-from cleargs.pipeline.live import (
-    PROGRESS_FILE,
-    RunningStage,
-    preview_of,
-    recorded_progress,
-    running_stage,
-    stage_at_work,
-)
+from cleargs.pipeline.live import RunningStage, preview_of, recorded_progress, running_stage, stage_at_work
+from cleargs.pipeline.run_file import PROGRESS_FILE
 from cleargs.progress import COMPILING, LineReporter, SilentReporter
 from cleargs.splat.state import save_state
 
