@@ -12,7 +12,7 @@ from cleargs.errors import InputError
 from cleargs.models.registry import Source, find_model, load_registry, model_dir, state
 from cleargs.models.registry import verify as verify_model
 
-_TEXT = "what it does, and where it is from"
+_TEXT = "work and source"
 
 _dir_option = click.option(
     "--dir",

@@ -32,7 +32,7 @@ LOCK = ".lock"
 """Lock file of the process that works in the run folder."""
 
 PROGRESS_FILE = ".at_work.json"
-"""File with the progress of the stage at work. It stays if the stage stops before its end."""
+"""File with the progress of the running stage. It stays if the stage stops before its end."""
 
 OWN_NAMES = (RUN_FILE, LOCK, RUN_LOG, EVAL, PROGRESS_FILE, VIEWS, "report", "report.html")
 """Files and folders in a run that ClearGS reads or writes, apart from those of the stages."""
