@@ -75,8 +75,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     frames = [frame for frame in frames if is_wanted(frame.path, source, config)]
     others = {path for folder in folders for path in image_files(folder)}
     others -= {path for frame in frames for path in (frame.path, frame.mask)}
-    listed = f"{' and '.join(file.name for file in files)} list{'s' * (len(files) == 1)}"
-    told = f"read: {len(frames)} pictures that {listed}"
+    lists = f"{' and '.join(file.name for file in files)} list{'s' * (len(files) == 1)}"
+    told = f"read: {len(frames)} pictures that {lists}"
     told += f"; left out: {len(others)} others next to them" if others else ""
     frames.sort(key=lambda frame: frame_key(frame.name))
     names = [name_below_images(frame.name) for frame in frames]
