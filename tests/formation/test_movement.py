@@ -90,6 +90,15 @@ def test_a_thing_in_one_frame_does_not_count_and_the_rest_does() -> None:
     assert both is not None and torch.equal(both, counts & mask)
 
 
+def test_a_screen_keeps_the_picture_of_most_frames() -> None:
+    """It is seen in all frames, and two of six show another picture on it."""
+    shift = 160.0 * STEP / DEPTH  # px between two frames
+    places = [80 - shift * k for k in range(FRAMES)]
+    boxes = {k: ((int(x) - 20, 30, int(x) + 20, 70),) for k, x in enumerate(places)}
+    other = {k: with_disc(disc(places[k])) for k in (1, 4)}
+    assert sorted(looked(other, movement(likely=boxes)).masks()) == [1, 4]
+
+
 def test_less_evidence_suffices_where_a_person_is_seen() -> None:
     faint = {2: picture() + 0.035 * disc(radius=8)[..., None]}
     box = {2: ((50, 40, 70, 60),)}
