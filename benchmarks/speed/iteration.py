@@ -8,11 +8,11 @@ from torch import Tensor
 from benchmarks.speed.probe import timed_kernels
 from benchmarks.speed.random_scenes import random_image
 from benchmarks.speed.timing import Clock
-from cleargs.splat.backend import LossAccumulator, rasteriser_for, set_threads, step_gaussians
+from cleargs.splat.backend import LossAccumulator, backend_for, set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.pipeline import CpuForwardPass, CpuRasteriser
-from cleargs.splat.types import Moments
+from cleargs.splat.types import Moments, Rates
 
 PARTS = ("forward", "loss", "backward", "adam")
 WHOLE = "iteration"
@@ -36,12 +36,13 @@ class Iteration:
     def __init__(self, gaussians: Gaussians, camera: Camera, device: torch.device | str = "cpu") -> None:
         self.gaussians = gaussians.to(device)
         self.camera = camera
-        self.engine = rasteriser_for(device)
+        self._backend = backend_for(device)
+        self.engine = self._backend.rasteriser(torch.device(device))
         self._target = random_image(camera.width, camera.height).to(device)
         self._gradient = torch.empty_like(self._target)
         self._losses = LossAccumulator(device, SSIM_LAMBDA)
         self._moments = Moments.zeros(self.gaussians)
-        self._rates: dict[str, float | Tensor] = dict.fromkeys(self.gaussians.tensors(), 0.0)
+        self._rates = Rates(*[0.0] * len(Rates._fields))
         self._step = 0
 
     def run(self, clock: Clock) -> None:
@@ -55,7 +56,12 @@ class Iteration:
             with clock.time("backward"):
                 gradients = self.backward(gradient)
             with clock.time("adam"):
-                step_gaussians(self.gaussians, gradients, self._moments, self._rates, step=self._step)
+                self._backend.step_gaussians(
+                    *(self.gaussians, gradients, self._moments, self._rates),
+                    step=self._step,
+                    opacity=0.0,
+                    scale=0.0,
+                )
 
     def image(self) -> Tensor:
         """Return the image [H, W, 3] that is compared with the target."""

@@ -72,11 +72,12 @@ SATURATED = 253 / 255
 """Value (sRGB) from which a frame image is saturated: the light was as bright as this or brighter."""
 
 
-def clip_to_saturation(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def clip_to_saturation(image: Tensor, target: Tensor, saturated: float = SATURATED) -> tuple[Tensor, Tensor]:
     """Return a render as the sensor of a frame image records it, and a mask of the values that change.
 
-    Both images are [H, W, 3] sRGB. If the frame image is saturated and the render is brighter, the value of
-    the frame image replaces that of the render. So one overexposed frame does not darken a lamp.
+    Both images are [H, W, 3] sRGB. If the frame image is ``saturated`` or brighter and the render is brighter
+    than it, the value of the frame image replaces that of the render. So one overexposed frame does not
+    darken a lamp.
     """
-    too_bright = (target >= SATURATED) & (image > target)
+    too_bright = (target >= saturated) & (image > target)
     return torch.where(too_bright, target, image), too_bright

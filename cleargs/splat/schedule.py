@@ -6,12 +6,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from cleargs.random_streams import Stream
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.scene import Colour
-from cleargs.splat.types import Rate
+from cleargs.splat.types import Rates
 
 SH_REST_DIVISOR = 5.0
 """Divisor of the rate of the SH terms above the constant (Inria: 20, with which highlights need more steps
@@ -54,31 +53,30 @@ class Schedule:
     ``config`` has a number of steps (`cleargs.splat.budget.resolve_config`).
     """
 
-    def __init__(self, config: TrainConfig, coefficients: int, device: torch.device | str = "cpu") -> None:
+    def __init__(self, config: TrainConfig) -> None:
         self._config = config
         factor = rate_factor(config.planned) if config.rate_factor is None else config.rate_factor
         self._factor = factor
-        sh = torch.full((coefficients * 3,), factor * config.lr_sh / SH_REST_DIVISOR, device=device)
-        sh[:3] = factor * config.lr_sh
-        self._first: dict[str, Rate] = {
-            "log_scales": factor * config.lr_scales,
-            "rotations": factor * config.lr_rotations,
-            "logit_opacities": config.lr_opacities,
-            "sh": sh,
-        }
+        self._sh = factor * config.lr_sh, factor * config.lr_sh / SH_REST_DIVISOR
 
     def rate_of_means(self, step: int) -> float:
         """Return the learning rate of the means."""
         decay = float(self._config.lr_means_final ** (step / self._config.planned))
         return self._factor * self._config.lr_means * decay
 
-    def rates(self, step: int) -> dict[str, Rate]:
-        """Return every learning rate by parameter name."""
-        left = float(self._config.lr_final ** (step / self._config.planned))
-        return {
-            "means": self.rate_of_means(step),
-            **{name: rate * left for name, rate in self._first.items()},
-        }
+    def rates(self, step: int) -> Rates:
+        """Return every learning rate. Those of the SH are rounded to float32."""
+        config, factor = self._config, self._factor
+        left = float(config.lr_final ** (step / config.planned))
+        sh, sh_rest = (float(np.float32(rate) * np.float32(left)) for rate in self._sh)
+        return Rates(
+            self.rate_of_means(step),
+            factor * config.lr_scales * left,
+            factor * config.lr_rotations * left,
+            config.lr_opacities * left,
+            sh,
+            sh_rest,
+        )
 
     def image_factor(self, step: int) -> float:
         """Return the factor on width and height of the training images."""

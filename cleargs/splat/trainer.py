@@ -20,13 +20,13 @@ from torch import Tensor
 
 from cleargs.errors import InputError, StageError
 from cleargs.random_streams import Stream
-from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
+from cleargs.splat.backend import LossAccumulator, backend_for
 from cleargs.splat.budget import resolve_config, seconds_by_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.densification import relative_error
 from cleargs.splat.densifier import Densifier, DensifierState, load_densifier
-from cleargs.splat.formation import Formation, Formed, clip_to_saturation
+from cleargs.splat.formation import SATURATED, Formation, Formed, clip_to_saturation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.rasteriser import view_numbers
@@ -84,12 +84,12 @@ class Trainer:
             )
         self._moments = Moments.zeros(self._gaussians) if moments is None else moments.to(self._device)
         self._earlier_steps = 0 if moments is None else config.first
-        self._schedule = Schedule(config, self._gaussians.sh.shape[1], self._device)
+        self._schedule = Schedule(config)
         self._densifier = load_densifier(config)
         self._errors: Tensor | None = None  # [N], see `DensifierState`
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
-        self._losses = LossAccumulator(self._device, config.ssim_lambda)
+        self._losses = LossAccumulator(self._device, config.ssim_lambda, saturated=SATURATED)
         self._texture = TextureLoss(self._device) if config.texture > 0.0 else None
         self._log = TrainLog(self.length)
         self._image_gradients: dict[tuple[int, int], Tensor] = {}
@@ -144,7 +144,6 @@ class Trainer:
             affine = None if formed is None else formed.affine
             target = _over(target, alpha, colour or self._scene.background, affine)
             mask = mask if formed is None else _with_empty(formed.mask, mask, alpha)
-        image, too_bright = clip_to_saturation(image, target)
         self._log.add_view(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         with timed("loss"):
             gradient = self._add_loss(image, target, mask, weight)
@@ -152,9 +151,10 @@ class Trainer:
             crop = crop_of(self._seed, schedule_step, *target.shape[:2])
             share = config.texture * weight * image[crop].numel() / image.numel()
             hidden = None if mask is None else mask[crop]
+            recorded, too_bright = clip_to_saturation(image[crop], target[crop])
             with timed("texture"):
-                gradient[crop] += share * self._texture.gradient(image[crop], target[crop], hidden)
-        gradient.masked_fill_(too_bright, 0.0)
+                slope = share * self._texture.gradient(recorded, target[crop], hidden)
+                gradient[crop] += slope.masked_fill_(too_bright, 0.0)
         if self._densifier is not None and self._densifier.wants_errors(schedule_step):
             with timed("errors of the Gaussians"):
                 errors = self._error_per_gaussian(image, target, mask, weight, formed)
@@ -164,15 +164,14 @@ class Trainer:
         with timed("backward pass"):
             gradients = self._rasteriser.backward(gradient)
         with timed("optimiser"):
-            self._backend.regularise(
-                self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
-            )
-            step_gaussians(
+            self._backend.step_gaussians(
                 self._gaussians,
                 gradients,
                 self._moments,
                 self._schedule.rates(schedule_step),
                 step=self._earlier_steps + self.done + 1,
+                opacity=config.opacity_reg,
+                scale=config.scale_reg,
             )
         if formed is not None:  # last, because it may wait for the device
             formed.learn()
@@ -277,7 +276,8 @@ class Trainer:
         The weight of a Gaussian in a pixel is the derivative of the pixel with respect to its colour, so the
         backward pass sums weight times error over the pixels.
         """
-        error = relative_error(image, target, mask).mul_(weight)
+        recorded, _ = clip_to_saturation(image, target)
+        error = relative_error(recorded, target, mask).mul_(weight)
         gradients = self._rasteriser.backward(error if formed is None else formed.backward(error))
         return gradients.sh[:, 0].sum(dim=1).clamp_(min=0.0)
 

@@ -19,8 +19,15 @@ class Render(NamedTuple):
     depth: Tensor | None  # [H, W] sum of weight * camera z, not divided by alpha; None: not requested
 
 
-Rate = float | Tensor
-"""A learning rate, or one per column of a parameter."""
+class Rates(NamedTuple):
+    """Learning rates of a step by parameter."""
+
+    means: float
+    log_scales: float
+    rotations: float
+    logit_opacities: float
+    sh: float  # rate of the constant term
+    sh_rest: float  # rate of the other terms
 
 
 class Reading(NamedTuple):

@@ -152,10 +152,10 @@ class ImageCache:
         height, width = stored.shape[:2]
         if (height, width) not in self._scratch:
             self._scratch[height, width] = torch.empty(height, width, 3, device=self._device)
-        image = self._scratch[height, width].copy_(stored)
+        image = self._scratch[height, width]
         if stored.dtype == torch.uint8:
-            image /= self._white
-        return image, mask
+            return torch.div(stored, self._white, out=image), mask
+        return image.copy_(stored), mask
 
 
 def _prepare(

@@ -32,7 +32,7 @@ from cleargs.splat.kernels.cuda import (
 F32, F64, I16, I32, I64, U8 = "*fp32", "*fp64", "*i16", "*i32", "*i64", "*u8"
 SCENE = dict.fromkeys(("means", "log_scales", "rotations", "logits", "sh"), F32)
 SIZE = {"width": "i32", "height": "i32"}
-IMAGE = {"image": F32, "target": F32, "height": "i32", "length": "i32"}
+IMAGE = {"image": F32, "target": F32, "saturated": "fp32", "height": "i32", "length": "i32"}
 FIELDS = dict.fromkeys(("offset", "sweep", "radius", "curve"), F32)
 PHOTOGRAPH = {"height": "i32", "width": "i32", "margin": "i32"}
 GRADIENTS = {f"grad_{name}": F32 for name in SCENE}
@@ -52,31 +52,52 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             {"num_warps": 1, **UNFUSED},
         ),
         (
+            binning.place_pairs,
+            {
+                **{"sorted_tiles": I16, "sorted_slots": I64},
+                **dict.fromkeys(("pair_owners", "pair_ids", "pair_slots", "tile_starts"), I32),
+                **dict.fromkeys(("pairs", "tiles", "halvings"), "i32"),
+            },
+            {},
+            {},
+        ),
+        (
             gradients.total,
-            {"tile_counts": I32, "pair_starts": I32, "pair_sums": F32, "totals": F64, "n": "i32"},
+            {
+                **dict.fromkeys(("tile_counts", "reached", "pair_starts"), I32),
+                **{"pair_sums": F32, "totals": F64, "n": "i32"},
+            },
             {"COLUMNS": 9},
             {},
         ),
         (
             elementwise.adam,
             {
-                **dict.fromkeys(("parameter", "gradient", "first", "second", "rates"), F32),
-                **{"size": "i32", "columns": "i32"},
-                **dict.fromkeys(("beta1", "beta2", "epsilon", "correction", "root_correction"), "fp32"),
+                **SCENE,
+                **{f"{kind}_{name}": F32 for kind in ("grad", "first", "second") for name in SCENE},
+                "n": "i32",
+                **{f"rate_{name}": "fp32" for name in (*SCENE, "sh_rest")},
+                **dict.fromkeys(("beta1", "beta2", "epsilon", "root_correction"), "fp32"),
+                **dict.fromkeys(("by_opacity", "by_scale"), "fp32"),
             },
-            {},
+            {"COLUMNS": 48},
             {},
         ),
         (
             densify.add_noise,
             {
-                **dict.fromkeys(("means", "log_scales", "rotations", "logits", "draws"), F32),
-                **{"amount": "fp32", "min_opacity": "fp32", "cut": "fp32", "n": "i32"},
+                **dict.fromkeys(("means", "log_scales", "rotations", "logits"), F32),
+                **{"seed": "i64", "amount": "fp32", "min_opacity": "fp32", "cut": "fp32", "n": "i32"},
             },
             {},
             {},
         ),
-        (loss.window_maps, {"maps": F32, "sums": F32, "height": "i32", "length": "i32"}, {}, {}),
+        (
+            loss.window_maps,
+            {"maps": F32, "sums": F32, "partials": F64, "totals": F64, "height": "i32", "length": "i32"},
+            {},
+            {},
+        ),
     ]
     found += [
         (
@@ -121,8 +142,9 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             ),
         ]
     for extra in (False, True):  # depth and anti-aliasing
-        frame = {"tile_starts": I32, "chunk_starts": I32, "chunk_planes": F32, "deepest": I32}
+        frame = {"tile_starts": I32, "chunk_planes": F32, "deepest": I32, **SIZE}
         planes = {"PLANES": 4 + extra}
+        background = dict.fromkeys(("back_red", "back_green", "back_blue"), "fp32")
         found += [
             (
                 projection.project,
@@ -134,6 +156,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
                         "splats": F32,
                         "depth_keys": F32,
                         "tile_counts": I32,
+                        "reached": I32,
                         "radii": F32,
                     },
                     **{"n": "i32", **SIZE},
@@ -144,10 +167,9 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             (
                 rasterise.forward,
                 {
-                    **{**frame, "pair_ids": I32, "chunk_tiles": I32, "last": I32, **SIZE},
-                    **dict.fromkeys(
-                        ("splats", "background", "image", "alpha", "transmittance", "depth"), F32
-                    ),
+                    **{**frame, **background},
+                    **dict.fromkeys(("pair_ids", "chunk_tiles", "last", "reached"), I32),
+                    **dict.fromkeys(("splats", "image", "alpha", "transmittance", "depth"), F32),
                 },
                 {"WITH_DEPTH": extra, **planes},
                 {"num_warps": 2},
@@ -155,9 +177,9 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             (
                 rasterise.behind,
                 {
-                    **{"chunk_starts": I32, "chunk_planes": F32, "deepest": I32, **SIZE},
-                    **dict.fromkeys(("background", "transmittance", "grad_image", "grad_alpha"), F32),
-                    **{"grad_depth": F32, "chunk_behind": F32},
+                    **{**frame, **background},
+                    **dict.fromkeys(("transmittance", "grad_image", "grad_alpha", "grad_depth"), F32),
+                    "chunk_behind": F32,
                 },
                 {"HAS_ALPHA": extra, "HAS_DEPTH": extra, **planes},
                 {},
@@ -165,9 +187,9 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             (
                 rasterise.backward,
                 {
-                    **{**frame, "chunk_tiles": I32, "pair_ids": I32, "pair_slots": I32, "last": I32, **SIZE},
+                    **{**frame, "chunk_tiles": I32, "pair_ids": I32, "pair_slots": I32, "last": I32},
                     **dict.fromkeys(("chunk_behind", "splats", "grad_image", "grad_depth", "pair_sums"), F32),
-                    "tiles": "i32",
+                    "reached": I32,
                 },
                 {"HAS_DEPTH": extra, **planes, "COLUMNS": 9 + extra},
                 {"num_warps": 1},
@@ -175,7 +197,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             (
                 gradients.backpropagate,
                 {
-                    **{**SCENE, "view": F64, "poses": F64, "splats": F32, "tile_counts": I32, "totals": F64},
+                    **{**SCENE, "view": F64, "poses": F64, "splats": F32, "reached": I32, "totals": F64},
                     **{**GRADIENTS, "n": "i32"},
                 },
                 {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "HAS_DEPTH": extra, "ROLLS": extra},

@@ -17,6 +17,7 @@ from cleargs.splat.backend import psnr, rasteriser_for
 from helpers.losses import adam_step, photometric_loss
 from cleargs.splat.backend import backend_for
 from cleargs.splat.backend import set_threads
+from cleargs.splat.types import Moments
 
 def digest(threads):
     set_threads(threads)
@@ -27,7 +28,7 @@ def digest(threads):
     target = torch.rand(101, 150, 3, generator=torch.Generator().manual_seed(1))
     mask = target[..., 0] > 0.2
     engine = rasteriser_for()
-    moments = {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in scene.tensors().items()}
+    moments = Moments.zeros(scene)
     for step in range(1, 4):
         view = engine.forward(scene, camera, depth=True, antialias=step == 2)
         loss = photometric_loss(view.image, target, ssim_lambda=0.2, mask=mask)
@@ -36,8 +37,7 @@ def digest(threads):
         for tensor in (*view, loss.grad_image, affine, engine.visible, *gradients.tensors().values()):
             result.update(tensor.numpy().tobytes())
         result.update(repr((loss.loss, loss.l1, loss.ssim, psnr(view.image, target))).encode())
-        for name, tensor in scene.tensors().items():
-            adam_step(tensor, getattr(gradients, name), *moments[name], step, 0.01)
+        adam_step(scene, gradients, moments, step)
     for tensor in scene.tensors().values():
         assert tensor.isfinite().all()
         result.update(tensor.numpy().tobytes())

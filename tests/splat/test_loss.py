@@ -10,6 +10,9 @@ import torch.nn.functional as F  # noqa: N812  # torch's own name for it
 from helpers.losses import adam_step, photometric_loss
 
 from cleargs.splat.backend import backend_for, psnr
+from cleargs.splat.formation import clip_to_saturation
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.types import Moments, Rates
 
 
 def images(height: int, width: int, device: torch.device | str = "cpu"):
@@ -136,32 +139,67 @@ def test_psnr_refuses_images_that_do_not_match():
             psnr(image, other, mask)
 
 
-@pytest.mark.parametrize("shape", [(1000, 16, 3), (1100, 3), (9,), (1, 4)])
-def test_adam_equals_torch(shape, device):
+def drawn(count: int, coefficients: int, generator: torch.Generator) -> Gaussians:
+    """Return parameters of normal random numbers."""
+    shapes = ((count, 3), (count, 3), (count, 4), (count,), (count, coefficients, 3))
+    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
+
+
+def by_rate(gaussians: Gaussians) -> dict[str, torch.Tensor]:
+    """Return the tensors with a learning rate each, by its name."""
+    tensors = gaussians.tensors()
+    return {**tensors, "sh": tensors["sh"][:, :1], "sh_rest": tensors["sh"][:, 1:]}
+
+
+@pytest.mark.parametrize(("count", "coefficients"), [(1100, 16), (9, 1), (1, 4)])
+def test_adam_equals_torch(count, coefficients, device):
     generator = torch.Generator().manual_seed(0)
-    start = torch.randn(shape, generator=generator)
-    mine = start.to(device)
-    first, second = torch.zeros_like(mine), torch.zeros_like(mine)
-    theirs = start.double().requires_grad_()
-    optimiser = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.999), eps=1e-15)
+    start = drawn(count, coefficients, generator)
+    mine, moments = start.clone().to(device), Moments.zeros(start.to(device))
+    rates = Rates(0.01, 0.008, 0.006, 0.004, 0.01, 0.002)
+    theirs = {name: tensor.double().requires_grad_() for name, tensor in by_rate(start).items()}
+    groups = [{"params": [tensor], "lr": getattr(rates, name)} for name, tensor in theirs.items()]
+    optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
     for step in range(1, 5):
-        gradient = torch.randn(shape, generator=generator)
-        gradient[0] = 0.0
-        theirs.grad = gradient.double()
+        gradients = drawn(count, coefficients, generator)
+        for name, gradient in by_rate(gradients).items():
+            gradient[0] = 0.0
+            theirs[name].grad = gradient.double()
         optimiser.step()
-        adam_step(mine, gradient.to(device), first, second, step, 1e-2)
-    assert (mine.cpu() - theirs).abs().max() < 2e-6
-    assert torch.equal(mine.cpu()[0], start[0])
+        adam_step(mine, gradients.to(device), moments, step, rates)
+    for name, tensor in by_rate(mine.to("cpu")).items():
+        assert ((tensor - theirs[name]).abs() < 2e-6).all(), name
+        assert torch.equal(tensor[0], by_rate(start)[name][0]), name
 
 
-def test_adam_takes_a_rate_per_column(device):
+def test_the_regularisers_equal_autograd(device):
+    """The first moment after a step is a tenth of the gradient."""
     generator = torch.Generator().manual_seed(0)
-    start, gradient = (torch.randn(50, 4, 3, generator=generator).to(device) for _ in range(2))
-    rates = torch.linspace(0.001, 0.012, 12)
-    mine, first, second = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
-    adam_step(mine, gradient, first, second, 1, rates)
-    expected = gradient.sign() * rates.to(device).reshape(4, 3)
-    torch.testing.assert_close(start - mine, expected, rtol=1e-4, atol=1e-6)
+    start, gradients = drawn(300, 4, generator), drawn(300, 4, generator)
+    opacities, scales = (
+        tensor.double().requires_grad_() for tensor in (start.logit_opacities, start.log_scales)
+    )
+    (0.3 * opacities.sigmoid().mean() + 0.2 * scales.exp().mean()).backward()
+    expected = gradients.clone().tensors()
+    expected["logit_opacities"] = expected["logit_opacities"] + opacities.grad
+    expected["log_scales"] = expected["log_scales"] + scales.grad
+    moments = Moments.zeros(start.to(device))
+    backend_for(device).step_gaussians(
+        *(start.to(device), gradients.to(device), moments, Rates(*[0.0] * 6)), step=1, opacity=0.3, scale=0.2
+    )
+    for name, first in moments.first.items():
+        torch.testing.assert_close(first.cpu().double(), 0.1 * expected[name].double(), rtol=1e-5, atol=1e-8)
+
+
+def test_a_brighter_value_than_a_saturated_one_counts_as_equal(device):
+    image, target, generator = images(14, 50, device)
+    mask = (torch.rand(14, 50, generator=generator) > 0.3).to(device)
+    recorded, too_bright = clip_to_saturation(image, target, 0.7)
+    assert 0.05 < too_bright.double().mean() < 0.5
+    expected = photometric_loss(recorded, target, ssim_lambda=0.2, mask=mask)
+    found = photometric_loss(image, target, ssim_lambda=0.2, mask=mask, saturated=0.7)
+    assert (found.loss, found.l1, found.ssim) == (expected.loss, expected.l1, expected.ssim)
+    assert torch.equal(found.grad_image, expected.grad_image.masked_fill(too_bright, 0.0))
 
 
 def test_exposure_equals_autograd(device):

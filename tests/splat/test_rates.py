@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-import torch
 
 from cleargs.scene.config import G0Config
 from cleargs.splat.config import TrainConfig
@@ -11,15 +10,11 @@ from cleargs.splat.schedule import INRIA_STEPS, Schedule, rate_factor
 from cleargs.stages.config import RivrConfig, RoundsConfig
 from cleargs.stages.consolidate import FinalDistilConfig
 
-GROUPS = ("means", "log_scales", "rotations", "sh", "logit_opacities")
+GROUPS = ("means", "log_scales", "rotations", "sh", "sh_rest", "logit_opacities")
 
 
 def rates(config: TrainConfig, step: int) -> dict[str, float]:
-    found = Schedule(config, coefficients=4).rates(step)
-    return {
-        name: float(value.max() if isinstance(value, torch.Tensor) else value)
-        for name, value in found.items()
-    }
+    return Schedule(config).rates(step)._asdict()
 
 
 def test_a_short_training_learns_faster() -> None:

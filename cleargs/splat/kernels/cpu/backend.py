@@ -17,6 +17,7 @@ from torch import Tensor
 from cleargs.splat import densification
 from cleargs.splat.camera import Camera, Readout
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
+from cleargs.splat.formation import clip_to_saturation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import blur_sums as blur_kernels
 from cleargs.splat.kernels.cpu import elementwise, frame_search, frame_warp, loss
@@ -29,7 +30,7 @@ from cleargs.splat.kernels.warp_layout import (
     MOTION_COLUMNS,
     DisplacementFields,
 )
-from cleargs.splat.types import Moments, Rate
+from cleargs.splat.types import Moments, Rates
 from cleargs.types import AnyArray, ArrayF32
 
 ADAM_BLOCK = 4096
@@ -47,8 +48,10 @@ def loss_sums(
     *,
     l1_weight: float,
     ssim_weight: float,
+    saturated: float,
     gradient: Tensor,
 ) -> Tensor:
+    image, too_bright = clip_to_saturation(image, target, saturated)
     shape = (image.shape[0], loss.padded_length(image.shape[1]))
     padded, padded_target, counted = (np.empty(shape, np.float32) for _ in range(3))
     # No kernel reads the padding of the maps, so it need not be set.
@@ -66,6 +69,7 @@ def loss_sums(
             loss.differentiate(
                 padded, padded_target, counted, window, maps, l1_scale, ssim_scale, gradient.numpy()
             )
+    gradient.masked_fill_(too_bright, 0.0)
     squared, _ = squared_errors(image, target, mask)
     return torch.tensor([l1, similarity, squared, count], dtype=torch.float64)
 
@@ -88,13 +92,37 @@ def _compared(
     return _read(image), _read(target), None if mask is None else _read(mask)
 
 
-def adam_step(
-    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate
+def step_gaussians(
+    gaussians: Gaussians,
+    gradients: Gaussians,
+    moments: Moments,
+    rates: Rates,
+    *,
+    step: int,
+    opacity: float,
+    scale: float,
 ) -> None:
-    columns = parameter.numel() // len(parameter)
-    rates = np.asarray(rate, np.float64).reshape(-1)
+    _regularise(gaussians, gradients, opacity=opacity, scale=scale)
+    slopes = gradients.tensors()
+    for name, parameter in gaussians.tensors().items():
+        if parameter.numel():
+            by_column = np.full(parameter.numel() // len(parameter), getattr(rates, name))
+            if name == "sh":
+                by_column[3:] = rates.sh_rest
+            _adam(parameter, slopes[name], moments.first[name], moments.second[name], step, by_column)
+
+
+def _adam(
+    parameter: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    step: int,
+    rates: npt.NDArray[np.float64],  # a learning rate per column
+) -> None:
+    columns = len(rates)
     beta1, beta2 = ADAM_BETAS
-    corrected = np.broadcast_to(rates / (1.0 - beta1**step), (columns,)).astype(np.float32)
+    corrected = (rates / (1.0 - beta1**step)).astype(np.float32)
     value, slope, m, v = (tensor.detach().view(-1).numpy() for tensor in (parameter, gradient, first, second))
     with LAUNCHING:
         elementwise.adam(
@@ -103,7 +131,8 @@ def adam_step(
         )
 
 
-def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
+def _regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
+    """Add the gradients of opacity * mean(opacities) + scale * mean(scales)."""
     if opacity > 0.0:
         opacities = densification.sigmoid(gaussians.logit_opacities.numpy())
         weight = np.float32(opacity / gaussians.num)
@@ -332,8 +361,9 @@ def warm_up() -> None:
     pipeline.backward(image, plane, plane)
     pipeline.forward(scene, replace(camera, readout=Readout(np.zeros((3, 6)), 1.0, 0.0)))
     for counted in (None, mask):
-        loss_sums(image, image, counted, l1_weight=0.8, ssim_weight=-0.2, gradient=image.clone())
-    adam_step(row, row.clone(), row.clone(), row.clone(), 1, 0.0)
+        weights = {"l1_weight": 0.8, "ssim_weight": -0.2, "saturated": 1.0}
+        loss_sums(image, image, counted, **weights, gradient=image.clone())
+    _adam(row, row.clone(), row.clone(), row.clone(), 1, np.zeros(3))
     add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     apply_affine(image, affine)
     affine_backward(image, affine, image)

@@ -8,13 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.cuda.densify import add_position_noise as add_position_noise
 from cleargs.splat.kernels.cuda.densify import refine as refine
-from cleargs.splat.kernels.cuda.elementwise import adam_step as adam_step
 from cleargs.splat.kernels.cuda.elementwise import affine_backward as affine_backward
 from cleargs.splat.kernels.cuda.elementwise import apply_affine as apply_affine
+from cleargs.splat.kernels.cuda.elementwise import step_gaussians as step_gaussians
 from cleargs.splat.kernels.cuda.frame_warp import displacements as displacements
 from cleargs.splat.kernels.cuda.frame_warp import expose as expose
 from cleargs.splat.kernels.cuda.frame_warp import expose_backward as expose_backward
@@ -38,11 +37,3 @@ def squared_errors(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[
     errors = (image.detach().double() - target.double()).square()
     errors = errors if mask is None else errors[mask]
     return float(errors.sum()), float(errors.numel())
-
-
-def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
-    if opacity > 0.0:
-        opacities = gaussians.logit_opacities.sigmoid()
-        gradients.logit_opacities += opacity / gaussians.num * opacities * (1 - opacities)
-    if scale > 0.0:
-        gradients.log_scales += scale / gaussians.log_scales.numel() * gaussians.log_scales.exp()

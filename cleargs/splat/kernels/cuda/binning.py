@@ -6,10 +6,8 @@ bits for up to 32,766 tiles). Both sorts are torch's stable ones, which are radi
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
@@ -125,13 +123,27 @@ def list_pairs(splats, order, tile_counts, pair_ends, pair_starts, pair_tiles, p
         slot += length
 
 
-def tile_starts(sorted_tiles: Tensor, tiles: int) -> Tensor:
-    """Return the first place of every tile, and the end: [tiles + 1] int32."""
-    numbers = torch.arange(tiles + 1, dtype=sorted_tiles.dtype, device=sorted_tiles.device)
-    return torch.searchsorted(sorted_tiles, numbers, out_int32=True)
+@triton.jit(do_not_specialize=["pairs", "tiles", "halvings"])
+def place_pairs(
+    sorted_tiles, sorted_slots, pair_owners, pair_ids, pair_slots, tile_starts, pairs, tiles, halvings
+):
+    """Store Gaussian and slot of every place, and each tile's first place and the end: ``tile_starts``.
 
-
-def chunk_starts(starts: Tensor) -> Tensor:
-    """Return the first chunk of every tile, and the end [tiles + 1] int32, from those of the places."""
-    chunks = (starts.diff() + (device_layout.CHUNK - 1)) // device_layout.CHUNK
-    return torch.nn.functional.pad(chunks.cumsum(0), (1, 0)).to(torch.int32)
+    A lane is a place, and a tile of ``tile_starts`` [tiles + 1] if there are as many. It bisects the sorted
+    tiles ``halvings`` times.
+    """
+    lane = tl.program_id(0).to(tl.int64) * device_layout.PLACE_BLOCK + tl.arange(0, device_layout.PLACE_BLOCK)
+    some = lane < pairs
+    slot = tl.load(sorted_slots + lane, mask=some, other=0)
+    tl.store(pair_slots + lane, slot.to(tl.int32), mask=some)
+    tl.store(pair_ids + lane, tl.load(pair_owners + slot, mask=some, other=0), mask=some)
+    if tl.program_id(0) * device_layout.PLACE_BLOCK <= tiles:
+        low = tl.zeros_like(lane)
+        high = low + pairs
+        for _ in range(0, halvings):
+            middle = (low + high) // 2
+            tile = tl.load(sorted_tiles + middle, mask=low < high, other=0)
+            before = (low < high) & (tile < lane)
+            low = tl.where(before, middle + 1, low)
+            high = tl.where(before, high, middle)
+        tl.store(tile_starts + lane, low.to(tl.int32), mask=lane <= tiles)

@@ -1,6 +1,7 @@
 """Refinement and noise of 3DGS-MCMC on the GPU, by the rules of ``cleargs.splat.densification``.
 
-Random numbers come from torch's generator with the step's seed: one device draws the same numbers each time.
+Random numbers depend on the step's seed only: those of a refinement come from torch's generator, those of the
+noise from Philox in the kernel.
 """
 
 from __future__ import annotations
@@ -64,18 +65,21 @@ def refine(
     return Gaussians(**grown), Moments(*running)
 
 
-@triton.jit(do_not_specialize=["n"])
-def add_noise(means, log_scales, rotations, logits, draws, amount, min_opacity, cut, n):
-    """Add ``amount`` times the covariance times a normal vector, ``draws`` [N, 3], to the means [N, 3].
+@triton.jit(do_not_specialize=["seed", "n"])
+def add_noise(means, log_scales, rotations, logits, seed, amount, min_opacity, cut, n):
+    """Add ``amount`` times the covariance times a normal vector to the means [N, 3].
 
-    The noise fades out above ``min_opacity``. Gaussians with an opacity of ``cut`` or more get none.
+    Philox draws the vector of each Gaussian from ``seed`` and its number. The noise fades out above
+    ``min_opacity``. Gaussians with an opacity of ``cut`` or more get none.
     """
     g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
     opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + g, mask=g < n, other=0.0).to(tl.float64)))
     some = (g < n) & (opacity < cut)
     fade = amount / (1.0 + tl.exp(100.0 * (opacity - min_opacity)))
     columns = rotation_columns(unit_quaternion(rotations, g, some))
-    scales, draw = load_triple(log_scales + g * 3, some), load_triple(draws + g * 3, some)
+    scales = load_triple(log_scales + g * 3, some)
+    draw0, draw1, draw2, _ = tl.randn4x(seed, g)
+    draw = (draw0.to(tl.float64), draw1.to(tl.float64), draw2.to(tl.float64))
     part0 = fade * tl.exp(2.0 * scales[0]) * dot(columns[0], draw)
     part1 = fade * tl.exp(2.0 * scales[1]) * dot(columns[1], draw)
     part2 = fade * tl.exp(2.0 * scales[2]) * dot(columns[2], draw)
@@ -83,17 +87,16 @@ def add_noise(means, log_scales, rotations, logits, draws, amount, min_opacity, 
     moved = combine(part0, columns[0], part1, columns[1])
     moved = combine(1.0, moved, part2, columns[2])
     moved = combine(1.0, moved, 1.0, mean)
-    store_triple(means + g * 3, moved, some, some)
+    store_triple(means + g * 3, moved, some)
 
 
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
     """Add the noise of one step to the means of Gaussians below ``densification.NOISE_CUT``, in place."""
-    generator = torch.Generator(gaussians.device).manual_seed(seed_of(seed))
-    draws = torch.randn(gaussians.num, 3, generator=generator, device=gaussians.device)
     parameters = (gaussians.means, gaussians.log_scales, gaussians.rotations, gaussians.logit_opacities)
     if gaussians.num:
         add_noise[(-(-gaussians.num // PROJECT_BLOCK),)](
-            *parameters, draws, amount, min_opacity, densification.NOISE_CUT, gaussians.num, num_warps=4
+            *(*parameters, seed_of(seed), amount, min_opacity, densification.NOISE_CUT, gaussians.num),
+            num_warps=4,
         )

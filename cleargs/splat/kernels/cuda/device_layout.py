@@ -4,8 +4,10 @@ A *pair* is a tile and a splat that touch. A pair has two numbers. Its *slot* co
 the nearest splat, then of the next. Pairs are listed by slot, and the backward pass stores its sums by slot.
 Its *place* counts by tile: all pairs of tile 0 from near to far, then of tile 1. Pairs are blended by place.
 
-A *chunk* is ``CHUNK`` places of one tile. The forward pass stores the transmittance behind each chunk and the
-colour that the chunk added, so that the backward pass treats all chunks at the same time.
+A *chunk* is ``CHUNK`` places of one tile. The first chunk of tile t, whose places begin at s, has the number
+s // CHUNK + t. So each tile has as many numbers as it needs or one more, and nothing counts chunks. The
+forward pass stores the transmittance behind each chunk and the colour that the chunk added, so that the
+backward pass treats all chunks at the same time.
 """
 
 from __future__ import annotations
@@ -17,12 +19,14 @@ from cleargs.splat.constants import LOG2_ALPHA_CUT, SSIM_RADIUS, SSIM_SIGMA
 CHUNK = 64
 """Pairs between two checkpoints of the forward pass."""
 
-# Work of one program: numbers (Adam), Gaussians, pairs, or values of an image (loss).
+# Work of one program: numbers (Adam), Gaussians, places, or values of an image (loss).
 NUMBERS_BLOCK = 1024
 PROJECT_BLOCK = 128
 LIST_BLOCK = 32
+PLACE_BLOCK = 256
 TOTAL_ROWS, TOTAL_BLOCK = 16, 16  # Gaussians, and pairs of a Gaussian that are added at a time
 LOSS_ROWS, LOSS_COLUMNS = 4, 128  # rows of an image, and values in each
+LOSS_SUMS = 256  # programs whose sums are added at a time
 
 # Planes of TILE_PIXELS values that the forward pass stores for each chunk.
 CHUNK_TRANSMITTANCE = 0  # transmittance behind the chunk

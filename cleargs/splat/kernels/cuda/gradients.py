@@ -28,22 +28,25 @@ from cleargs.splat.kernels.cuda.projection import (
 
 
 @triton.jit(do_not_specialize=["n"])
-def total(tile_counts, pair_starts, pair_sums, totals, n, COLUMNS: tl.constexpr):
-    """Add each Gaussian's pair sums in float64, in the order of the slots: ``totals`` [COLUMNS, N]."""
+def total(tile_counts, reached, pair_starts, pair_sums, totals, n, COLUMNS: tl.constexpr):
+    """Add the pair sums of Gaussians with ``reached`` in float64, in the order of the slots.
+
+    ``totals`` [COLUMNS, N] keep what they held for other Gaussians.
+    """
     g = tl.program_id(0) * device_layout.TOTAL_ROWS + tl.arange(0, device_layout.TOTAL_ROWS)
-    mask = g < n
-    count = tl.load(tile_counts + g, mask=mask, other=0)
-    start = tl.load(pair_starts + g, mask=mask, other=0).to(tl.int64)
+    some = tl.load(reached + g, mask=g < n, other=0) > 0
+    count = tl.load(tile_counts + g, mask=some, other=0)
+    start = tl.load(pair_starts + g, mask=some, other=0).to(tl.int64)
     longest = tl.max(count, axis=0)
     for column in tl.static_range(COLUMNS):
         value = tl.zeros_like(start).to(tl.float64)
         for first in range(0, longest, device_layout.TOTAL_BLOCK):
             step = first + tl.arange(0, device_layout.TOTAL_BLOCK)
-            some = step[None, :] < count[:, None]
+            own = step[None, :] < count[:, None]
             slot = start[:, None] + step[None, :]
-            part = tl.load(pair_sums + slot * layout.PAIR_COLUMNS + column, mask=some, other=0.0)
+            part = tl.load(pair_sums + slot * layout.PAIR_COLUMNS + column, mask=own, other=0.0)
             value += tl.sum(part.to(tl.float64), axis=1)
-        tl.store(totals + column * n.to(tl.int64) + g, value, mask=mask)
+        tl.store(totals + column * n.to(tl.int64) + g, value, mask=some)
 
 
 @triton.jit
@@ -59,15 +62,29 @@ def quaternion_gradient(q, c0, c1, c2):
 
 
 @triton.jit
-def store_triple(pointer, triple, some, mask):
-    """Store three numbers as float32; 0 for a Gaussian that is not in ``some``."""
+def store_triple(pointer, triple, mask):
+    """Store three numbers as float32."""
     for i in tl.static_range(3):
-        tl.store(pointer + i, tl.where(some, triple[i], 0.0).to(tl.float32), mask=mask)
+        tl.store(pointer + i, triple[i].to(tl.float32), mask=mask)
+
+
+@triton.jit
+def clear(gradients, reached, n, COLUMNS: tl.constexpr):
+    """Store 0 in the rows [N, COLUMNS] of Gaussians without ``reached``.
+
+    Neighbouring lanes store neighbouring numbers: most Gaussians may be hidden.
+    """
+    first = tl.program_id(0) * device_layout.PROJECT_BLOCK
+    for part in tl.static_range(COLUMNS):
+        i = part * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
+        g = first + i // COLUMNS
+        hidden = tl.load(reached + g, mask=g < n, other=1) == 0
+        tl.store(gradients + first * COLUMNS + i, tl.zeros_like(i).to(tl.float32), mask=hidden)
 
 
 @triton.jit
 def sum_of(totals, column: tl.constexpr, g, n, some):
-    """Return one column of ``totals``; 0 for a Gaussian without pairs."""
+    """Return one column of ``totals``; 0 for a Gaussian that is not in ``some``."""
     return tl.load(totals + column * n.to(tl.int64) + g, mask=some, other=0.0)
 
 
@@ -81,7 +98,7 @@ def backpropagate(
     view,
     poses,
     splats,
-    tile_counts,
+    reached,
     totals,
     grad_means,
     grad_log_scales,
@@ -95,10 +112,14 @@ def backpropagate(
     HAS_DEPTH: tl.constexpr,
     ROLLS: tl.constexpr,
 ):
-    """Store the gradients of the five parameters. They are exactly 0 for a Gaussian that touches no tile."""
+    """Store the gradients of the five parameters. They are exactly 0 for Gaussians without ``reached``."""
     g = tl.program_id(0) * device_layout.PROJECT_BLOCK + tl.arange(0, device_layout.PROJECT_BLOCK)
-    mask = g < n
-    some = mask & (tl.load(tile_counts + g, mask=mask, other=0) > 0)
+    some = tl.load(reached + g, mask=g < n, other=0) > 0
+    clear(grad_means, reached, n, 3)
+    clear(grad_log_scales, reached, n, 3)
+    clear(grad_rotations, reached, n, 4)
+    clear(grad_logits, reached, n, 1)
+    clear(grad_sh, reached, n, SH_STORED * 3)
     sum_v = sum_of(totals, layout.SUM_V, g, n, some)
     mean = load_triple(means + g * 3, some)
     pose = pose_of(view, poses, g, some, ROLLS)
@@ -148,8 +169,8 @@ def backpropagate(
     m1 = combine(v0[1], row0, v1[1], row1)
     m2 = combine(v0[2], row0, v1[2], row1)
     by_scales = (dot(m0, axis0), dot(m1, axis1), dot(m2, axis2))
-    store_triple(grad_log_scales + g * 3, by_scales, some, mask)
-    tl.store(grad_logits + g, tl.where(some, grad_logit, 0.0).to(tl.float32), mask=mask)
+    store_triple(grad_log_scales + g * 3, by_scales, some)
+    tl.store(grad_logits + g, grad_logit.to(tl.float32), mask=some)
 
     by_quaternion = quaternion_gradient(quaternion, scaled(sx, m0), scaled(sy, m1), scaled(sz, m2))
     norm = quaternion[4]
@@ -160,7 +181,7 @@ def backpropagate(
     along = tl.where(norm > constants.QUATERNION_EPSILON, along, 0.0)
     for i in tl.static_range(4):
         value = (by_quaternion[i] - along * quaternion[i]) / norm
-        tl.store(grad_rotations + g * 4 + i, tl.where(some, value, 0.0).to(tl.float32), mask=mask)
+        tl.store(grad_rotations + g * 4 + i, value.to(tl.float32), mask=some)
 
     # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 is analogous
     r0 = combine(1.0, combine(v0[0], axis0, v0[1], axis1), v0[2], axis2)
@@ -206,11 +227,11 @@ def backpropagate(
             towards_x += shade * by_x[i]
             towards_y += shade * by_y[i]
             towards_z += shade * by_d[i]
-            store_triple(grad_sh + at, (basis[i] * red, basis[i] * green, basis[i] * blue), some, mask)
+            store_triple(grad_sh + at, (basis[i] * red, basis[i] * green, basis[i] * blue), some)
         else:
-            store_triple(grad_sh + at, (zero, zero, zero), some, mask)
+            store_triple(grad_sh + at, (zero, zero, zero), some)
     towards = (towards_x.to(tl.float64), towards_y.to(tl.float64), towards_z.to(tl.float64))
     radial = dot(towards, direction)
     for i in tl.static_range(3):
         value = by_position[i] + (towards[i] - radial * direction[i]) / distance
-        tl.store(grad_means + g * 3 + i, tl.where(some, value, 0.0).to(tl.float32), mask=mask)
+        tl.store(grad_means + g * 3 + i, value.to(tl.float32), mask=some)

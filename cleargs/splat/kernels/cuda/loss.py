@@ -3,10 +3,11 @@
 The mathematics is that of the CPU back end's ``loss``. The 11 x 11 window of SSIM is separable.
 ``window_rows`` sums x, y, x², y² and xy along the rows. ``measure`` sums the results along the columns, which
 gives the similarity and its derivatives by the window means. ``window_maps`` and ``differentiate`` do the
-same with the derivatives. An image row is 3 W interleaved values, so that neighbours in a channel are three
-values apart. Masked pixels are zero in both images, as are pixels outside the image.
+same with the derivatives. ``window_maps`` also adds the sums of ``measure``. An image row is 3 W interleaved
+values, so that neighbours in a channel are three values apart. Masked pixels are zero in both images, as are
+pixels outside the image. A value that is brighter than a saturated target counts as equal to it.
 
-Each program stores its sums in float64 at a separate place. torch adds them in a fixed order.
+Each program stores its sums in float64 at a separate place. One program adds them in a fixed order.
 """
 
 from __future__ import annotations
@@ -37,13 +38,16 @@ def zeros():
 
 
 @triton.jit
-def kept(values, mask, y, j, inside, length, HAS_MASK: tl.constexpr):
-    """Return the values at row y, place j: zero outside the image and where masked."""
-    value = tl.load(values + y * length + j, mask=inside, other=0.0)
+def compared(image, target, mask, saturated, y, j, inside, length, HAS_MASK: tl.constexpr):
+    """Return both images at row y, place j, zero outside and where masked, and the mask of values to clip."""
+    value = tl.load(image + y * length + j, mask=inside, other=0.0)
+    goal = tl.load(target + y * length + j, mask=inside, other=0.0)
+    too_bright = (goal >= saturated) & (value > goal)
+    value = tl.where(too_bright, goal, value)
     if HAS_MASK:
         counts = tl.load(mask + y * (length // 3) + j // 3, mask=inside, other=0)
-        value = tl.where(counts != 0, value, 0.0)
-    return value
+        value, goal = tl.where(counts != 0, value, 0.0), tl.where(counts != 0, goal, 0.0)
+    return value, goal, too_bright
 
 
 @triton.jit
@@ -58,15 +62,14 @@ def sum_of_rows(plane, y, i, height, length):
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def window_rows(image, target, mask, sums, height, length, HAS_MASK: tl.constexpr):
+def window_rows(image, target, mask, saturated, sums, height, length, HAS_MASK: tl.constexpr):
     """Store the window sums of x, y, x², y² and xy along the rows: ``sums`` [5, H, length]."""
     y, i, here = places(height, length)
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = zeros(), zeros(), zeros(), zeros(), zeros()
     for tap in tl.static_range(11):
         j = i + 3 * (tap - 5)
         inside = (y < height) & (j >= 0) & (j < length)
-        a = kept(image, mask, y, j, inside, length, HAS_MASK)
-        b = kept(target, mask, y, j, inside, length, HAS_MASK)
+        a, b, _ = compared(image, target, mask, saturated, y, j, inside, length, HAS_MASK)
         weighted_a = a * device_layout.SSIM_WINDOW[tap]
         weighted_b = b * device_layout.SSIM_WINDOW[tap]
         mean_x += weighted_a
@@ -84,7 +87,7 @@ def window_rows(image, target, mask, sums, height, length, HAS_MASK: tl.constexp
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def measure(image, target, mask, sums, maps, partials, height, length, HAS_MASK: tl.constexpr):
+def measure(image, target, mask, saturated, sums, maps, partials, height, length, HAS_MASK: tl.constexpr):
     """Store the derivatives of SSIM by the window means, ``maps`` [3, H, length], and sums [programs, 4]."""
     y, i, here = places(height, length)
     plane = height.to(tl.int64) * length
@@ -92,8 +95,7 @@ def measure(image, target, mask, sums, maps, partials, height, length, HAS_MASK:
     p = sum_of_rows(sums + 2 * plane, y, i, height, length)
     q = sum_of_rows(sums + 3 * plane, y, i, height, length)
     r = sum_of_rows(sums + 4 * plane, y, i, height, length)
-    a = kept(image, mask, y, i, here, length, HAS_MASK)
-    b = kept(target, mask, y, i, here, length, HAS_MASK)
+    a, b, _ = compared(image, target, mask, saturated, y, i, here, length, HAS_MASK)
     counts = here.to(tl.float32)
     if HAS_MASK:
         counts = tl.load(mask + y * (length // 3) + i // 3, mask=here, other=0).to(tl.float32)
@@ -119,9 +121,26 @@ def measure(image, target, mask, sums, maps, partials, height, length, HAS_MASK:
     tl.store(place + 3, tl.sum(tl.sum(counts.to(tl.float64), axis=1), axis=0))
 
 
+@triton.jit
+def add_partials(partials, totals, count):
+    """Store the sums over the ``count`` rows of ``partials`` [count, 4]."""
+    row = tl.arange(0, device_layout.LOSS_SUMS)[:, None]
+    column = tl.arange(0, 4)[None, :]
+    total = tl.zeros_like(row + column).to(tl.float64)
+    for first in range(0, count, device_layout.LOSS_SUMS):
+        at = partials + (first + row) * 4 + column
+        total += tl.load(at, mask=(first + row < count) & (column < 4), other=0.0)
+    tl.store(totals + tl.arange(0, 4), tl.sum(total, axis=0))
+
+
 @triton.jit(do_not_specialize=["height", "length"])
-def window_maps(maps, sums, height, length):
-    """Store the window sums of one of the three maps along the rows: ``sums`` [3, H, length]."""
+def window_maps(maps, sums, partials, totals, height, length):
+    """Store the window sums of one of the three maps along the rows: ``sums`` [3, H, length].
+
+    The first program also adds the ``partials`` of ``measure``, while others run: ``totals`` [4].
+    """
+    if tl.program_id(0) + tl.program_id(1) + tl.program_id(2) == 0:
+        add_partials(partials, totals, tl.num_programs(0) * tl.num_programs(1))
     y, i, here = places(height, length)
     plane = tl.program_id(2) * height.to(tl.int64) * length
     total = zeros()
@@ -138,6 +157,7 @@ def differentiate(
     image,
     target,
     mask,
+    saturated,
     sums,
     totals,
     gradient,
@@ -147,18 +167,17 @@ def differentiate(
     length,
     HAS_MASK: tl.constexpr,
 ):
-    """Store (l1_weight sign(x - y) + ssim_weight d(sum of SSIM)/dx) / count, and 0 where masked."""
+    """Store (l1_weight sign(x - y) + ssim_weight d(sum of SSIM)/dx) / count; 0 where masked or too bright."""
     y, i, here = places(height, length)
     plane = height.to(tl.int64) * length
     by_mean = sum_of_rows(sums, y, i, height, length)
     by_square = sum_of_rows(sums + plane, y, i, height, length)
     by_product = sum_of_rows(sums + 2 * plane, y, i, height, length)
-    a = kept(image, mask, y, i, here, length, HAS_MASK)
-    b = kept(target, mask, y, i, here, length, HAS_MASK)
+    a, b, too_bright = compared(image, target, mask, saturated, y, i, here, length, HAS_MASK)
     share = (1.0 / tl.maximum(tl.load(totals + 3), 1.0)).to(tl.float32)
     sign = tl.where(a > b, 1.0, tl.where(a < b, -1.0, 0.0))
     slope = by_mean + 2.0 * a * by_square + b * by_product
-    value = (l1_weight * sign + ssim_weight * slope) * share
+    value = tl.where(too_bright, 0.0, (l1_weight * sign + ssim_weight * slope) * share)
     if HAS_MASK:
         counts = tl.load(mask + y * (length // 3) + i // 3, mask=here, other=0)
         value = tl.where(counts != 0, value, 0.0)
@@ -173,6 +192,7 @@ def loss_sums(
     *,
     l1_weight: float,
     ssim_weight: float,
+    saturated: float,
     gradient: Tensor,
 ) -> Tensor:
     """See ``cleargs.splat.backend.Backend``. The sums stay on the device."""
@@ -180,12 +200,12 @@ def loss_sums(
     sums, maps = (torch.empty(planes * height * length, device=image.device) for planes in (5, 3))
     grid = (-(-length // LOSS_COLUMNS), -(-height // LOSS_ROWS))
     partials = torch.empty(grid[0] * grid[1], 4, dtype=torch.float64, device=image.device)
+    totals = torch.empty(4, dtype=torch.float64, device=image.device)
     bits = image if mask is None else mask.contiguous().view(torch.uint8)
-    images = image.detach().contiguous(), target.contiguous(), bits
+    images = image.detach().contiguous(), target.contiguous(), bits, saturated
     options = {"HAS_MASK": mask is not None, "num_warps": 4}
     window_rows[grid](*images, sums, *size, **options)
     measure[grid](*images, sums, maps, partials, *size, **options)
-    totals = partials.sum(0)
-    window_maps[(*grid, 3)](maps, sums, *size, num_warps=4)
+    window_maps[(*grid, 3)](maps, sums, partials, totals, *size, num_warps=4)
     differentiate[grid](*images, sums, totals, gradient, l1_weight, ssim_weight, *size, **options)
     return totals

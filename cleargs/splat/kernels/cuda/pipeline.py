@@ -12,11 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import rasteriser
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cuda import binning, device_layout, gradients, projection, rasterise
-from cleargs.splat.kernels.cuda.device_layout import LIST_BLOCK, PROJECT_BLOCK, TOTAL_ROWS
+from cleargs.splat.kernels.cuda.device_layout import LIST_BLOCK, PLACE_BLOCK, PROJECT_BLOCK, TOTAL_ROWS
 from cleargs.splat.kernels.cuda.support import memory_errors
 from cleargs.splat.kernels.rasteriser import tiles_of
 from cleargs.splat.types import Render
@@ -33,21 +34,24 @@ PAIR_BYTES = 4 * (
 SORT_BYTES = 24
 """Bytes per pair while pairs are sorted by tile: key and number, twice."""
 
+KEPT_VIEWS = 4096
+"""Cameras whose numbers stay on the device, at most; each takes 512 bytes."""
+
 
 @dataclass(frozen=True, eq=False)
 class CudaForwardPass(rasteriser.ForwardPass):
     """Data that the backward pass needs from one forward pass."""
 
     view: Tensor  # float64 [23]
-    background: Tensor  # [3]
+    background: tuple[float, float, float]
     planes: int  # planes per chunk
     splats: Tensor  # [N, 16]
     tile_counts: Tensor  # [N] int32
+    reached: Tensor  # [N] int32, see ``rasterise.forward``
     pair_starts: Tensor  # [N] int32, first slot of each Gaussian
     pair_ids: Tensor  # [P] int32, the Gaussian of each place
     pair_slots: Tensor  # [P] int32
     tile_starts: Tensor  # [tiles + 1] int32
-    chunk_starts: Tensor  # [tiles + 1] int32
     chunk_tiles: Tensor  # [C] int32
     chunk_planes: Tensor  # [C, planes, 256]
     deepest: Tensor  # [tiles] int32
@@ -69,6 +73,20 @@ class CudaRasteriser(rasteriser.Rasteriser):
     )
     pair_bytes = PAIR_BYTES + SORT_BYTES
 
+    def __init__(self, device: torch.device) -> None:
+        super().__init__(device)
+        self._views: dict[tuple[float, ...], Tensor] = {}
+
+    def _view(self, camera: Camera) -> Tensor:
+        """Return the numbers of a camera on the device, float64 [23]. They are copied once per camera."""
+        numbers = tuple(rasteriser.view_numbers(camera))
+        if numbers not in self._views:
+            if len(self._views) >= KEPT_VIEWS:
+                self._views.clear()
+            view = torch.tensor(numbers, dtype=torch.float64)
+            self._views[numbers] = view.to(self._buffers.device, non_blocking=True)
+        return self._views[numbers]
+
     def _launching(self) -> AbstractContextManager[Any]:
         return memory_errors()
 
@@ -78,9 +96,10 @@ class CudaRasteriser(rasteriser.Rasteriser):
         image, alpha = take("image", *shape, 3), take("alpha", *shape)
         depths = take("depth", *shape) if depth else None
         rasterise.forward[(tiles_of(camera),)](
-            *(state.tile_starts, state.chunk_starts, state.pair_ids, state.splats, state.background),
+            *(state.tile_starts, state.pair_ids, state.splats, *state.background),
             *(image, alpha, state.transmittance, state.last, alpha if depths is None else depths),
-            *(state.chunk_planes, state.chunk_tiles, state.deepest, camera.width, camera.height),
+            *(state.chunk_planes, state.chunk_tiles, state.deepest, state.reached),
+            *(camera.width, camera.height),
             WITH_DEPTH=depth,
             PLANES=state.planes,
             num_warps=FORWARD_WARPS,
@@ -100,7 +119,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
         by_alpha, by_depth = (grad_image if grad is None else grad for grad in (grad_alpha, grad_depth))
         given: dict[str, Any] = {"HAS_DEPTH": grad_depth is not None, "PLANES": state.planes}
         rasterise.behind[(tiles,)](
-            *(state.chunk_starts, state.chunk_planes, state.deepest, state.background, state.transmittance),
+            *(state.tile_starts, state.chunk_planes, state.deepest, *state.background, state.transmittance),
             *(grad_image, by_alpha, by_depth, chunk_behind, camera.width, camera.height),
             HAS_ALPHA=grad_alpha is not None,
             **given,
@@ -108,9 +127,9 @@ class CudaRasteriser(rasteriser.Rasteriser):
         )
         if pairs:
             rasterise.backward[(chunks,)](
-                *(state.tile_starts, state.chunk_starts, state.chunk_tiles, state.chunk_planes, chunk_behind),
-                *(state.deepest, state.pair_ids, state.pair_slots, state.splats, state.last),
-                *(grad_image, by_depth, pair_sums, tiles, camera.width, camera.height),
+                *(state.tile_starts, state.chunk_tiles, state.chunk_planes, chunk_behind, state.deepest),
+                *(state.pair_ids, state.pair_slots, state.splats, state.last, grad_image, by_depth),
+                *(pair_sums, state.reached, camera.width, camera.height),
                 COLUMNS=columns,
                 **given,
                 num_warps=BACKWARD_WARPS,
@@ -120,11 +139,13 @@ class CudaRasteriser(rasteriser.Rasteriser):
         if n:
             totals = take("totals", layout.PAIR_COLUMNS, n, dtype=torch.float64)
             gradients.total[(-(-n // TOTAL_ROWS),)](
-                state.tile_counts, state.pair_starts, pair_sums, totals, n, COLUMNS=columns, num_warps=4
+                *(state.tile_counts, state.reached, state.pair_starts, pair_sums, totals, n),
+                COLUMNS=columns,
+                num_warps=4,
             )
             gradients.backpropagate[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in parameters.values()),
-                *(state.view, _poses(state, state.view), state.splats, state.tile_counts, totals),
+                *(state.view, _poses(state, state.view), state.splats, state.reached, totals),
                 *(*outputs.values(), n),
                 SH_STORED=state.gaussians.sh.shape[1],
                 SH_COUNT=state.sh_count,
@@ -139,18 +160,19 @@ class CudaRasteriser(rasteriser.Rasteriser):
         self, inputs: rasteriser.ForwardPass, background: tuple[float, float, float], depth: bool
     ) -> CudaForwardPass:
         gaussians, camera = inputs.gaussians, inputs.camera
-        take, device = self._buffers.take, self._buffers.device
+        take = self._buffers.take
         n, width, height, tiles = gaussians.num, camera.width, camera.height, tiles_of(camera)
-        numbers = rasteriser.view_numbers(camera)
-        view = torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
+        view = self._view(camera)
         splats = take("splats", n, layout.SPLAT_COLUMNS)
         depth_keys, self.radii = take("depth_keys", n), take("radii", n)
         tile_counts = take("tile_counts", n, dtype=torch.int32)
+        reached = take("reached", n, dtype=torch.int32)
         pair_starts = take("pair_starts", n, dtype=torch.int32)
         if n:
             projection.project[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in gaussians.tensors().values()),
-                *(view, _poses(inputs, view), splats, depth_keys, tile_counts, self.radii, n, width, height),
+                *(view, _poses(inputs, view), splats, depth_keys, tile_counts, reached, self.radii),
+                *(n, width, height),
                 SH_STORED=gaussians.sh.shape[1],
                 SH_COUNT=inputs.sh_count,
                 ANTIALIAS=inputs.antialias,
@@ -175,24 +197,26 @@ class CudaRasteriser(rasteriser.Rasteriser):
                 enable_fp_fusion=False,
             )
         sorted_tiles, sorted_slots = torch.sort(pair_tiles, stable=True)
-        torch.index_select(pair_owners, 0, sorted_slots, out=pair_ids)
-        pair_slots.copy_(sorted_slots)
-        tile_starts = binning.tile_starts(sorted_tiles, tiles)
+        tile_starts = take("tile_starts", tiles + 1, dtype=torch.int32)
+        binning.place_pairs[(-(-max(pairs, tiles + 1) // PLACE_BLOCK),)](
+            *(sorted_tiles, sorted_slots, pair_owners, pair_ids, pair_slots, tile_starts),
+            *(pairs, tiles, pairs.bit_length()),
+            num_warps=4,
+        )
         planes = device_layout.CHUNK_PLANES + depth
-        # Only the device knows the number of chunks. This is an upper bound.
-        chunks = pairs // device_layout.CHUNK + min(tiles, pairs)
+        chunks = pairs // device_layout.CHUNK + tiles
         return CudaForwardPass(
             **vars(inputs),
             view=view,
-            background=torch.tensor(background, dtype=torch.float32).to(device, non_blocking=True),
+            background=(float(background[0]), float(background[1]), float(background[2])),
             planes=planes,
             splats=splats,
             tile_counts=tile_counts,
+            reached=reached,
             pair_starts=pair_starts,
             pair_ids=pair_ids,
             pair_slots=pair_slots,
             tile_starts=tile_starts,
-            chunk_starts=binning.chunk_starts(tile_starts),
             chunk_tiles=take("chunk_tiles", chunks, dtype=torch.int32),
             chunk_planes=take("chunk_planes", chunks, planes, layout.TILE_PIXELS),
             deepest=take("deepest", tiles, dtype=torch.int32),

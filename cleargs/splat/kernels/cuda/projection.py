@@ -150,6 +150,7 @@ def project(
     splats,
     depth_keys,
     tile_counts,
+    reached,
     radii,
     n,
     width,
@@ -160,6 +161,8 @@ def project(
     ROLLS: tl.constexpr,
 ):
     """Store packed splats [N, 16], depth keys [N], numbers of touched tiles [N] int32 and radii [N] in px.
+
+    ``reached`` [N] is set to 0, for ``rasterise.forward``.
 
     A Gaussian is culled if it is behind the near plane, too faint, not finite, or touches no tile. Its key is
     then infinity, its count and its radius are 0. Launch it without fused multiply and add, as
@@ -197,6 +200,20 @@ def project(
     visible = visible & (reach >= 0.0) & is_finite(variance) & is_finite(xx) & is_finite(yy)
     visible = visible & is_finite(mean_x) & is_finite(mean_y)
 
+    row = splats + g * layout.SPLAT_COLUMNS
+    # Rounded once, here: the tiles are counted from the stored numbers.
+    mean_x, mean_y = mean_x.to(tl.float32), mean_y.to(tl.float32)
+    bend_x, bend_y = (
+        (device_layout.HALF_LOG2E / variance).to(tl.float32),
+        (device_layout.HALF_LOG2E / yy).to(tl.float32),
+    )
+    skew, log2_opacity = skew.to(tl.float32), log2_opacity.to(tl.float32)
+    extent_x, extent_y = tl.sqrt(reach * xx).to(tl.float32), tl.sqrt(reach * yy).to(tl.float32)
+    extent_x_at = (xy * tl.sqrt(reach / xx)).to(tl.float32)
+    ellipse = (mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at)
+    tiles = count_tiles(ellipse, visible, width, height)
+    touches = tiles > 0
+
     centre = view_triple(view, device_layout.VIEW_CENTRE)
     towards = (mean[0] - centre[0], mean[1] - centre[1], mean[2] - centre[2])
     distance = tl.sqrt(dot(towards, towards))
@@ -209,41 +226,29 @@ def project(
     red, green, blue = zero, zero, zero
     for k in tl.static_range(SH_COUNT):
         coefficient = sh + (g * SH_STORED + k) * 3
-        red += basis[k] * tl.load(coefficient, mask=mask, other=0.0)
-        green += basis[k] * tl.load(coefficient + 1, mask=mask, other=0.0)
-        blue += basis[k] * tl.load(coefficient + 2, mask=mask, other=0.0)
-    visible = visible & is_finite(red) & is_finite(green) & is_finite(blue)
+        red += basis[k] * tl.load(coefficient, mask=touches, other=0.0)
+        green += basis[k] * tl.load(coefficient + 1, mask=touches, other=0.0)
+        blue += basis[k] * tl.load(coefficient + 2, mask=touches, other=0.0)
+    touches = touches & is_finite(red) & is_finite(green) & is_finite(blue)
 
-    row = splats + g * layout.SPLAT_COLUMNS
-    # Rounded once, here: the tiles are counted from the stored numbers.
-    mean_x, mean_y = mean_x.to(tl.float32), mean_y.to(tl.float32)
-    bend_x, bend_y = (
-        (device_layout.HALF_LOG2E / variance).to(tl.float32),
-        (device_layout.HALF_LOG2E / yy).to(tl.float32),
-    )
-    skew, log2_opacity = skew.to(tl.float32), log2_opacity.to(tl.float32)
-    extent_x, extent_y = tl.sqrt(reach * xx).to(tl.float32), tl.sqrt(reach * yy).to(tl.float32)
-    extent_x_at = (xy * tl.sqrt(reach / xx)).to(tl.float32)
-    tl.store(row + layout.MEAN_X, mean_x, mask=visible)
-    tl.store(row + layout.MEAN_Y, mean_y, mask=visible)
-    tl.store(row + layout.BEND_X, bend_x, mask=visible)
-    tl.store(row + layout.SKEW, skew, mask=visible)
-    tl.store(row + layout.BEND_Y, bend_y, mask=visible)
-    tl.store(row + layout.LOG2_OPACITY, log2_opacity, mask=visible)
-    tl.store(row + layout.RED, tl.maximum(red + constants.SH_OFFSET, 0.0), mask=visible)
-    tl.store(row + layout.GREEN, tl.maximum(green + constants.SH_OFFSET, 0.0), mask=visible)
-    tl.store(row + layout.BLUE, tl.maximum(blue + constants.SH_OFFSET, 0.0), mask=visible)
+    tl.store(row + layout.MEAN_X, mean_x, mask=touches)
+    tl.store(row + layout.MEAN_Y, mean_y, mask=touches)
+    tl.store(row + layout.BEND_X, bend_x, mask=touches)
+    tl.store(row + layout.SKEW, skew, mask=touches)
+    tl.store(row + layout.BEND_Y, bend_y, mask=touches)
+    tl.store(row + layout.LOG2_OPACITY, log2_opacity, mask=touches)
+    tl.store(row + layout.RED, tl.maximum(red + constants.SH_OFFSET, 0.0), mask=touches)
+    tl.store(row + layout.GREEN, tl.maximum(green + constants.SH_OFFSET, 0.0), mask=touches)
+    tl.store(row + layout.BLUE, tl.maximum(blue + constants.SH_OFFSET, 0.0), mask=touches)
     if ROLLS:  # different poses would mix the order of Gaussians on one surface
         still = camera_position(mean, pose_of(view, poses, g, mask, False))
         z = tl.maximum(still[2], constants.NEAR)
-    tl.store(row + layout.DEPTH, z.to(tl.float32), mask=visible)
-    tl.store(row + layout.EXTENT_X, extent_x, mask=visible)
-    tl.store(row + layout.EXTENT_Y, extent_y, mask=visible)
-    tl.store(row + layout.EXTENT_X_AT, extent_x_at, mask=visible)
+    tl.store(row + layout.DEPTH, z.to(tl.float32), mask=touches)
+    tl.store(row + layout.EXTENT_X, extent_x, mask=touches)
+    tl.store(row + layout.EXTENT_Y, extent_y, mask=touches)
+    tl.store(row + layout.EXTENT_X_AT, extent_x_at, mask=touches)
 
-    ellipse = (mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at)
-    tiles = count_tiles(ellipse, visible, width, height)
-    touches = tiles > 0
-    tl.store(tile_counts + g, tiles, mask=mask)
+    tl.store(tile_counts + g, tl.where(touches, tiles, 0), mask=mask)
+    tl.store(reached + g, tl.zeros_like(tiles), mask=mask)
     tl.store(depth_keys + g, tl.where(touches, z.to(tl.float32), float("inf")), mask=mask)
     tl.store(radii + g, tl.where(touches, tl.maximum(extent_x, extent_y), 0.0), mask=mask)

@@ -35,6 +35,12 @@ def pixels_of(tile, width, height):
 
 
 @triton.jit
+def first_chunk(begin, tile):
+    """Return the number of the first chunk of a tile whose places start at ``begin``."""
+    return begin // device_layout.CHUNK + tile
+
+
+@triton.jit
 def splat_alpha(x, y, row):
     """Return u, dy, alpha before clamp and cut, and blended alpha of a packed splat, at pixel centres.
 
@@ -51,10 +57,11 @@ def splat_alpha(x, y, row):
 @triton.jit(do_not_specialize=["width", "height"])
 def forward(
     tile_starts,
-    chunk_starts,
     pair_ids,
     splats,
-    background,
+    back_red,
+    back_green,
+    back_blue,
     image,
     alpha,
     transmittance,
@@ -63,6 +70,7 @@ def forward(
     chunk_planes,
     chunk_tiles,
     deepest,
+    reached,
     width,
     height,
     WITH_DEPTH: tl.constexpr,
@@ -71,13 +79,13 @@ def forward(
     """Store one tile of image [H, W, 3], alpha, transmittance, last contributor (from 1) and depth [H, W].
 
     Also store, for the backward pass, the planes of its chunks [C, PLANES, 256], the tile of each chunk, and
-    the number of the tile's last contributor.
+    the number of the tile's last contributor; and 1 in ``reached`` [N] for each Gaussian up to that one.
     """
     tile = tl.program_id(0)
     pixel, at, inside, x, y = pixels_of(tile, width, height)
     begin, end = tl.load(tile_starts + tile), tl.load(tile_starts + tile + 1)
-    chunk = tl.load(chunk_starts + tile)
-    chunks = tl.load(chunk_starts + tile + 1) - chunk
+    chunk = first_chunk(begin, tile)
+    chunks = first_chunk(end, tile + 1) - chunk
     for first in range(0, chunks, layout.TILE_PIXELS):
         number = first + pixel
         tl.store(chunk_tiles + chunk + number, tl.zeros_like(pixel) + tile, mask=number < chunks)
@@ -132,10 +140,15 @@ def forward(
         start = stop
         goes_on = (start < end) & (tl.max(live, axis=0) > 0.0)
 
-    tl.store(deepest + tile, tl.max(deep, axis=0))
-    tl.store(image + at * 3, red + rest * tl.load(background), mask=inside)
-    tl.store(image + at * 3 + 1, green + rest * tl.load(background + 1), mask=inside)
-    tl.store(image + at * 3 + 2, blue + rest * tl.load(background + 2), mask=inside)
+    contributing = tl.max(deep, axis=0)
+    tl.store(deepest + tile, contributing)
+    for first in range(0, contributing, layout.TILE_PIXELS):
+        number = first + pixel
+        g = tl.load(pair_ids + begin + number, mask=number < contributing, other=0)
+        tl.store(reached + g, tl.zeros_like(pixel) + 1, mask=number < contributing)
+    tl.store(image + at * 3, red + rest * back_red, mask=inside)
+    tl.store(image + at * 3 + 1, green + rest * back_green, mask=inside)
+    tl.store(image + at * 3 + 2, blue + rest * back_blue, mask=inside)
     tl.store(alpha + at, 1.0 - rest, mask=inside)
     tl.store(transmittance + at, rest, mask=inside)
     tl.store(last + at, deep, mask=inside)
@@ -145,10 +158,12 @@ def forward(
 
 @triton.jit(do_not_specialize=["width", "height"])
 def behind(
-    chunk_starts,
+    tile_starts,
     chunk_planes,
     deepest,
-    background,
+    back_red,
+    back_green,
+    back_blue,
     transmittance,
     grad_image,
     grad_alpha,
@@ -166,11 +181,11 @@ def behind(
     red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
     green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
     blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
-    far = red * tl.load(background) + green * tl.load(background + 1) + blue * tl.load(background + 2)
+    far = red * back_red + green * back_green + blue * back_blue
     if HAS_ALPHA:  # alpha = 1 - T
         far -= tl.load(grad_alpha + at, mask=inside, other=0.0)
     far *= tl.load(transmittance + at, mask=inside, other=0.0)
-    chunk = tl.load(chunk_starts + tile).to(tl.int64)
+    chunk = first_chunk(tl.load(tile_starts + tile), tile).to(tl.int64)
     reached = (tl.load(deepest + tile) + (device_layout.CHUNK - 1)) // device_layout.CHUNK
     for step in range(0, reached):
         number = chunk + (reached - 1 - step)
@@ -184,10 +199,9 @@ def behind(
             far += z * tl.load(planes + device_layout.CHUNK_DEPTH * layout.TILE_PIXELS)
 
 
-@triton.jit(do_not_specialize=["tiles", "width", "height"])
+@triton.jit(do_not_specialize=["width", "height"])
 def backward(
     tile_starts,
-    chunk_starts,
     chunk_tiles,
     chunk_planes,
     chunk_behind,
@@ -199,7 +213,7 @@ def backward(
     grad_image,
     grad_depth,
     pair_sums,
-    tiles,
+    reached,
     width,
     height,
     HAS_DEPTH: tl.constexpr,
@@ -208,64 +222,65 @@ def backward(
 ):
     """Store the sums of every pair of one chunk, in the rows of ``pair_sums`` [P, 10] at the pairs' slots.
 
-    Pairs are visited from far to near. Programs after the last chunk do nothing: the launch knows only an
-    upper bound of the number of chunks.
+    Pairs are visited from far to near. A chunk that its tile does not need has no pairs. Those of Gaussians
+    without ``reached`` are left out.
     """
     chunk = tl.program_id(0)
-    if chunk < tl.load(chunk_starts + tiles):
-        tile = tl.load(chunk_tiles + chunk)
-        begin = tl.load(tile_starts + tile)
-        start = begin + (chunk - tl.load(chunk_starts + tile)) * device_layout.CHUNK
-        end = tl.minimum(start + device_layout.CHUNK, tl.load(tile_starts + tile + 1))
-        contributing = tl.minimum(end, begin + tl.load(deepest + tile))
+    tile = tl.load(chunk_tiles + chunk)
+    begin = tl.load(tile_starts + tile)
+    start = begin + (chunk - first_chunk(begin, tile)) * device_layout.CHUNK
+    end = tl.minimum(start + device_layout.CHUNK, tl.load(tile_starts + tile + 1))
+    contributing = tl.minimum(end, begin + tl.load(deepest + tile))
 
-        places = start + tl.arange(0, device_layout.CHUNK)
-        unseen = (places >= contributing) & (places < end)
-        slots = tl.load(pair_slots + places, mask=unseen, other=0).to(tl.int64)
-        for k in tl.static_range(COLUMNS):
-            tl.store(pair_sums + slots * layout.PAIR_COLUMNS + k, 0.0, mask=unseen)
-        if start < contributing:
-            pixel, at, inside, x, y = pixels_of(tile, width, height)
-            deep = tl.load(last + at, mask=inside, other=0)
-            grad_red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
-            grad_green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
-            grad_blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
-            number = chunk.to(tl.int64) * layout.TILE_PIXELS
-            planes = chunk_planes + number * PLANES + pixel
-            t = tl.load(planes + device_layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS)
-            far = tl.load(chunk_behind + number + pixel)
+    places = start + tl.arange(0, device_layout.CHUNK)
+    unseen = (places >= contributing) & (places < end)
+    owners = tl.load(pair_ids + places, mask=unseen, other=0)
+    unseen = unseen & (tl.load(reached + owners, mask=unseen, other=0) > 0)
+    slots = tl.load(pair_slots + places, mask=unseen, other=0).to(tl.int64)
+    for k in tl.static_range(COLUMNS):
+        tl.store(pair_sums + slots * layout.PAIR_COLUMNS + k, 0.0, mask=unseen)
+    if start < contributing:
+        pixel, at, inside, x, y = pixels_of(tile, width, height)
+        deep = tl.load(last + at, mask=inside, other=0)
+        grad_red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
+        grad_green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
+        grad_blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
+        number = chunk.to(tl.int64) * layout.TILE_PIXELS
+        planes = chunk_planes + number * PLANES + pixel
+        t = tl.load(planes + device_layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS)
+        far = tl.load(chunk_behind + number + pixel)
+        if HAS_DEPTH:
+            grad_z = tl.load(grad_depth + at, mask=inside, other=0.0)
+        following = tl.load(pair_ids + contributing - 1)
+        for step in range(0, contributing - start):
+            place = contributing - 1 - step
+            g = following
+            following = tl.load(pair_ids + tl.maximum(place - 1, start))
+            row = splats + g.to(tl.int64) * layout.SPLAT_COLUMNS
+            u, dy, raw, blended = splat_alpha(x, y, row)
+            blended = tl.where(deep > place - begin, blended, 0.0)
+            inverse = 1.0 / (1.0 - blended)
+            t = t * inverse
+            weight = blended * t
+            gain = grad_red * tl.load(row + layout.RED)
+            gain += grad_green * tl.load(row + layout.GREEN)
+            gain += grad_blue * tl.load(row + layout.BLUE)
             if HAS_DEPTH:
-                grad_z = tl.load(grad_depth + at, mask=inside, other=0.0)
-            following = tl.load(pair_ids + contributing - 1)
-            for step in range(0, contributing - start):
-                place = contributing - 1 - step
-                g = following
-                following = tl.load(pair_ids + tl.maximum(place - 1, start))
-                row = splats + g.to(tl.int64) * layout.SPLAT_COLUMNS
-                u, dy, raw, blended = splat_alpha(x, y, row)
-                blended = tl.where(deep > place - begin, blended, 0.0)
-                inverse = 1.0 / (1.0 - blended)
-                t = t * inverse
-                weight = blended * t
-                gain = grad_red * tl.load(row + layout.RED)
-                gain += grad_green * tl.load(row + layout.GREEN)
-                gain += grad_blue * tl.load(row + layout.BLUE)
-                if HAS_DEPTH:
-                    gain += grad_z * tl.load(row + layout.DEPTH)
-                own = weight * gain
-                v = tl.where(raw < constants.ALPHA_MAX, own - blended * (far * inverse), 0.0)
-                far += own
-                vu = v * u
-                vy = v * dy
-                sums = pair_sums + tl.load(pair_slots + place).to(tl.int64) * layout.PAIR_COLUMNS
-                tl.store(sums + layout.SUM_V, tl.sum(v, axis=0))
-                tl.store(sums + layout.SUM_VU, tl.sum(vu, axis=0))
-                tl.store(sums + layout.SUM_VY, tl.sum(vy, axis=0))
-                tl.store(sums + layout.SUM_VUU, tl.sum(vu * u, axis=0))
-                tl.store(sums + layout.SUM_VUY, tl.sum(vu * dy, axis=0))
-                tl.store(sums + layout.SUM_VYY, tl.sum(vy * dy, axis=0))
-                tl.store(sums + layout.SUM_RED, tl.sum(weight * grad_red, axis=0))
-                tl.store(sums + layout.SUM_GREEN, tl.sum(weight * grad_green, axis=0))
-                tl.store(sums + layout.SUM_BLUE, tl.sum(weight * grad_blue, axis=0))
-                if HAS_DEPTH:
-                    tl.store(sums + layout.SUM_DEPTH, tl.sum(weight * grad_z, axis=0))
+                gain += grad_z * tl.load(row + layout.DEPTH)
+            own = weight * gain
+            v = tl.where(raw < constants.ALPHA_MAX, own - blended * (far * inverse), 0.0)
+            far += own
+            vu = v * u
+            vy = v * dy
+            sums = pair_sums + tl.load(pair_slots + place).to(tl.int64) * layout.PAIR_COLUMNS
+            tl.store(sums + layout.SUM_V, tl.sum(v, axis=0))
+            tl.store(sums + layout.SUM_VU, tl.sum(vu, axis=0))
+            tl.store(sums + layout.SUM_VY, tl.sum(vy, axis=0))
+            tl.store(sums + layout.SUM_VUU, tl.sum(vu * u, axis=0))
+            tl.store(sums + layout.SUM_VUY, tl.sum(vu * dy, axis=0))
+            tl.store(sums + layout.SUM_VYY, tl.sum(vy * dy, axis=0))
+            tl.store(sums + layout.SUM_RED, tl.sum(weight * grad_red, axis=0))
+            tl.store(sums + layout.SUM_GREEN, tl.sum(weight * grad_green, axis=0))
+            tl.store(sums + layout.SUM_BLUE, tl.sum(weight * grad_blue, axis=0))
+            if HAS_DEPTH:
+                tl.store(sums + layout.SUM_DEPTH, tl.sum(weight * grad_z, axis=0))

@@ -23,7 +23,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import warp_layout
 from cleargs.splat.kernels.cuda.support import gpu_fault
 from cleargs.splat.random_scene import random_scene
-from cleargs.splat.types import Moments
+from cleargs.splat.types import Moments, Rates
 
 
 class View(NamedTuple):
@@ -138,13 +138,17 @@ def render(view: View, backend: Backend, device: torch.device) -> Results:
 
 
 def loss(size: tuple[int, int], backend: Backend, device: torch.device) -> Results:
-    """Compute L1 and D-SSIM, with and without a mask, the squared error, and a colour affine."""
+    """Compute L1 and D-SSIM with and without a mask, the squared error, and a colour affine.
+
+    Targets from 0.9 are saturated.
+    """
     images = _random(*size, 6, device=device)
     image, target = images[..., :3].contiguous(), images[..., 3:].contiguous()
     close, results = within(1e-5, relative=True), Results()
     for name, mask in (("", None), (" with a mask", images[..., 0] > 0.3)):
         slope = torch.empty_like(image)
-        sums = backend.loss_sums(image, target, mask, l1_weight=0.8, ssim_weight=-0.2, gradient=slope)
+        weights = {"l1_weight": 0.8, "ssim_weight": -0.2, "saturated": 0.9}
+        sums = backend.loss_sums(image, target, mask, **weights, gradient=slope)
         squared = torch.tensor(backend.squared_errors(image, target, mask), dtype=torch.float64)
         results |= {f"loss{name}": (sums, close), f"gradient of the loss{name}": (slope, close)}
         results[f"squared error{name}"] = (squared, close)
@@ -158,11 +162,11 @@ def adam(view: View, backend: Backend, device: torch.device) -> Results:
     """Run three steps of Adam on regularised gradients."""
     gaussians, _ = view.scene(device)
     moments, gradients = Moments.zeros(gaussians), gaussians.clone()
-    backend.regularise(gaussians, gradients, opacity=0.01, scale=0.01)
+    rates = Rates(0.1, 0.2, 0.15, 0.1, 0.1, 0.05)
     for step in (1, 2, 3):
-        for name, tensor in gaussians.tensors().items():
-            first, second = moments.first[name], moments.second[name]
-            backend.adam_step(tensor, getattr(gradients, name), first, second, step, 0.1)
+        backend.step_gaussians(
+            gaussians, gradients.clone(), moments, rates, step=step, opacity=0.01, scale=0.01
+        )
     # 1 - 0.999 has a relative error of 1e-5 where 0.999 is rounded to float32.
     tensors = {**gaussians.tensors(), **moments.state()}
     return {name: (tensor, within(1e-4, relative=True)) for name, tensor in tensors.items()}
@@ -266,14 +270,15 @@ def iterate(view: View, repeats: int, backend: Backend, device: torch.device) ->
     gaussians, camera = view.scene(device)
     target = _random(view.height, view.width, 3, device=device)
     slope, moments, engine = torch.empty_like(target), Moments.zeros(gaussians), backend.rasteriser(device)
+    weights = {"l1_weight": 0.8, "ssim_weight": -0.2, "saturated": 1.0}
+    rates = Rates(*[0.0] * len(Rates._fields))
     times, held = [], 0
     for step in range(1, repeats + 4):
         start = time.perf_counter()
         image = engine.forward(gaussians, camera).image
-        backend.loss_sums(image, target, None, l1_weight=0.8, ssim_weight=-0.2, gradient=slope)
-        for name, gradient in engine.backward(slope).tensors().items():
-            first, second = moments.first[name], moments.second[name]
-            backend.adam_step(getattr(gaussians, name), gradient, first, second, step, 0.0)
+        backend.loss_sums(image, target, None, **weights, gradient=slope)
+        gradients = engine.backward(slope)
+        backend.step_gaussians(gaussians, gradients, moments, rates, step=step, opacity=0.0, scale=0.0)
         float(gaussians.means[0, 0])  # waits for the device
         times.append(1e3 * (time.perf_counter() - start))
         held = torch.cuda.memory_allocated() if step <= 3 else held
