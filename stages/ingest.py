@@ -74,6 +74,8 @@ _FEATURES_PER_MEGAPIXEL = 7000
 # its pose (mapping), and to triangulate points at its given pose.
 _START_S = 1.0
 _FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 1.3, 0.2
+_PICTURES_AROUND = 5
+"""Number of grey pictures that stay on disk for each frame of a video: the frame and those around it."""
 
 
 def externals(config: IngestConfig, source: Path) -> Mapping[str, External]:
@@ -130,6 +132,8 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
         alone += (_TRIANGULATION_S if capture.posed else _MAPPING_S) * megapixels * count
     seconds = parallel * thread_factor(context.threads) + alone
     disk = count * 2 * 1.6e-3 * megapixels + (0.0005 * count if needs_poses else 0.0)
+    if capture.kind == "video":
+        disk += count * _PICTURES_AROUND * 1e-3 * megapixels
     return Estimate(
         minutes=seconds / 60,
         memory_gb=0.4 + 0.001 * count,

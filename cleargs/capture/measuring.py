@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -29,8 +30,8 @@ from cleargs.capture.motion_job import (
     MotionJob,
     MotionOutcome,
 )
-from cleargs.capture.neighbours import neighbourhoods, pictures, repeats
-from cleargs.capture.prepare import WorkFrame
+from cleargs.capture.neighbours import Neighbourhood, in_order, neighbourhoods, read_pictures, repeats
+from cleargs.capture.prepare import WorkFrame, neighbour_file, read_image
 from cleargs.capture.sfm import Reconstruction
 from cleargs.files import atomic_path, make_folder, write_json
 from cleargs.parquet import schema_of, write_table
@@ -110,7 +111,7 @@ def measure_motion(
         {}, status, _lenses(frames, model, found=scene.outcome.method == "sfm"), {}, capture.has_clock
     )
     folder = work / "motion"
-    status |= _follow(capture, frames, model, folder, reporter)
+    status |= _follow(capture, frames, model, work, reporter)
     if TRACKED not in status.values():
         return scene, none
     write_model(folder / "start", model, np.zeros((len(model.xyz), 3), np.uint8))
@@ -136,12 +137,13 @@ def measure_motion(
 
 
 def _follow(
-    capture: Capture, frames: Sequence[WorkFrame], model: SparseModel, folder: Path, reporter: Reporter
+    capture: Capture, frames: Sequence[WorkFrame], model: SparseModel, work: Path, reporter: Reporter
 ) -> dict[str, str]:
-    """Track keypoints of ``model`` into the neighbours of their frames, into `TRACKS` in ``folder``.
+    """Track keypoints of ``model`` into the neighbours of their frames, into `TRACKS` in ``work/motion``.
 
     Returns the status of each working image that has neighbours.
     """
+    folder = work / "motion"
     keys = {image.name: key for key, image in model.images.items()}
     around = [one for one in neighbourhoods(capture) if frames[one.number].image in keys]
     if not around:
@@ -150,9 +152,10 @@ def _follow(
     if not (folder / TRACKS).is_file():
         arrays: dict[str, NDArray[np.generic]] = {}
         with reporter.task("following points into neighbouring frames", len(around)) as task:
-            for one, shown in pictures(around, frames):
+            for one in around:
                 name = frames[one.number].image
-                if not repeats(shown):
+                shown = _pictures(one, frames[one.number], work)
+                if shown is not None and not repeats(shown):
                     arrays |= _tracks(name, model.images[keys[name]], shown, one.times)
                 task.advance()
         with atomic_path(folder / TRACKS) as temporary:
@@ -161,6 +164,18 @@ def _follow(
         tracked = {name.removesuffix(".times") for name in stored.files if name.endswith(".times")}
     names = [frames[one.number].image for one in around]
     return {name: TRACKED if name in tracked else "repeated frames" for name in names}
+
+
+def _pictures(one: Neighbourhood, frame: WorkFrame, work: Path) -> list[ImageU8] | None:
+    """Return the grey pictures of ``frame`` and its neighbours in order of time, of the working image's size.
+
+    They are None if one of them cannot be decoded. Those of a video are in the folder ``work``.
+    """
+    if frame.source.pts is not None:
+        return read_pictures(neighbour_file(work, one.number))
+    size = frame.width, frame.height
+    grey = [cv2.cvtColor(read_image(source), cv2.COLOR_RGB2GRAY) for source in in_order(one, frame.source)]
+    return [np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA), np.uint8) for one in grey]
 
 
 def _lenses(frames: Sequence[WorkFrame], model: SparseModel, *, found: bool) -> dict[str, int]:

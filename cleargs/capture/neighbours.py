@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from cleargs.capture.capture import Capture, SourceFrame
-from cleargs.capture.prepare import WorkFrame, read_image
-from cleargs.media.video import decode_grey, read_timeline
+from cleargs.files import atomic_path
+from cleargs.media.video import read_timeline
 from cleargs.types import ImageU8
 
 REACH = 2
@@ -110,57 +110,48 @@ def _neighbourhood(number: int, times: list[float], others: list[SourceFrame]) -
     return [Neighbourhood(number, tuple(times[k] for k in order), tuple(others[k] for k in order))]
 
 
-def pictures(
-    around: Sequence[Neighbourhood], frames: Sequence[WorkFrame]
-) -> Iterator[tuple[Neighbourhood, list[ImageU8]]]:
-    """Yield the grey pictures of each frame and its neighbours in order of time, of the working image's size.
+class Gatherer:
+    """Gathers the pictures of the neighbourhoods of one video. `add` receives its frames in order of time."""
 
-    ``frames`` are all frames of the capture. Each video is decoded once. A neighbourhood with a frame that
-    cannot be decoded is left out.
-    """
-    for video in dict.fromkeys(frames[one.number].source.path for one in around):
-        members = [one for one in around if frames[one.number].source.path == video]
-        if frames[members[0].number].source.pts is None:
-            for one in members:
-                sources = _in_order(one, frames[one.number].source)
-                yield one, [_resized(_grey(source), frames[one.number]) for source in sources]
-        else:
-            yield from _of_video(video, members, frames)
+    def __init__(self, around: Mapping[Path, tuple[Neighbourhood, SourceFrame]]) -> None:
+        """Take file -> neighbourhood and its chosen frame. `read_pictures` reads the file."""
+        self._stamps = {
+            file: [source.pts for source in in_order(one, chosen) if source.pts is not None]
+            for file, (one, chosen) in around.items()
+        }
+        self._waiting = sorted(self._stamps, key=lambda file: max(self._stamps[file]))
+        self._held: dict[int, ImageU8] = {}
 
+    @property
+    def stamps(self) -> set[int]:
+        """Time stamps of the frames that are needed."""
+        return {pts for stamps in self._stamps.values() for pts in stamps}
 
-def _of_video(
-    video: Path, around: Sequence[Neighbourhood], frames: Sequence[WorkFrame]
-) -> Iterator[tuple[Neighbourhood, list[ImageU8]]]:
-    """Yield the pictures of `pictures` for one video. Pictures that no later frame needs are dropped."""
-    wanted = {
-        one.number: [source.pts for source in _in_order(one, frames[one.number].source)] for one in around
-    }
-    waiting = sorted(around, key=lambda one: max(pts or 0 for pts in wanted[one.number]))
-    held: dict[int, ImageU8] = {}
-    for pts, grey in decode_grey(
-        video, {pts for needed in wanted.values() for pts in needed if pts is not None}, upright=True
-    ):
-        held[pts] = _resized(grey, frames[around[0].number])
-        while waiting and max(p or 0 for p in wanted[waiting[0].number]) <= pts:
-            one = waiting.pop(0)
-            found = [held[p] for p in wanted[one.number] if p is not None and p in held]
-            if len(found) == len(one.times) + 1:
-                yield one, found
-            still_needed = {p for other in waiting for p in wanted[other.number]}
-            held = {p: picture for p, picture in held.items() if p in still_needed or p >= pts}
+    def add(self, pts: int, grey: ImageU8) -> None:  # [H, W]
+        """Write the pictures of the neighbourhoods that end with the frame ``pts``.
+
+        A neighbourhood with a frame that cannot be decoded gets no file.
+        """
+        self._held[pts] = grey
+        while self._waiting and max(self._stamps[self._waiting[0]]) <= pts:
+            file = self._waiting.pop(0)
+            shown = [self._held[stamp] for stamp in self._stamps[file] if stamp in self._held]
+            if len(shown) == len(self._stamps[file]):
+                with atomic_path(file) as temporary:
+                    np.save(temporary, np.stack(shown), allow_pickle=False)
+            needed = {stamp for other in self._waiting for stamp in self._stamps[other]}
+            self._held = {stamp: picture for stamp, picture in self._held.items() if stamp in needed}
 
 
-def _in_order(one: Neighbourhood, chosen: SourceFrame) -> list[SourceFrame]:
+def read_pictures(file: Path) -> list[ImageU8] | None:
+    """Return the grey pictures of a neighbourhood in order of time; None if it has no file."""
+    return list(np.load(file, allow_pickle=False)) if file.is_file() else None
+
+
+def in_order(one: Neighbourhood, chosen: SourceFrame) -> list[SourceFrame]:
+    """Return the frames of a neighbourhood, with its ``chosen`` one, in order of time."""
     before = sum(time < 0.0 for time in one.times)
     return [*one.others[:before], chosen, *one.others[before:]]
-
-
-def _grey(frame: SourceFrame) -> ImageU8:
-    return np.asarray(cv2.cvtColor(read_image(frame), cv2.COLOR_RGB2GRAY), np.uint8)
-
-
-def _resized(grey: ImageU8, frame: WorkFrame) -> ImageU8:
-    return np.asarray(cv2.resize(grey, (frame.width, frame.height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def repeats(shown: Sequence[ImageU8]) -> bool:

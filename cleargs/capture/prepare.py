@@ -13,6 +13,7 @@ from cleargs.capture.behind import StillRoom, still_room
 from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.cutouts import are_cut_outs, resampled
+from cleargs.capture.neighbours import Gatherer, Neighbourhood, neighbourhoods
 from cleargs.capture.overlay import without_scene, wraps_around
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
@@ -28,7 +29,7 @@ from cleargs.media.image import (
     write_mask,
     write_rgb,
 )
-from cleargs.media.video import decode_frames
+from cleargs.media.video import decode_with_grey
 from cleargs.progress import Reporter
 from cleargs.types import ImageU8, MaskU8
 
@@ -58,7 +59,8 @@ class WorkFrame:
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
     """Write the working images ``folder/images/%06d.png`` and their masks ``folder/masks/%06d.png.png``.
 
-    The names of masks are COLMAP's. Images are reduced to ``long_side`` px, never enlarged. Intact images of
+    The frames around those of a video, see `neighbour_file`, are decoded with them. The names of masks are
+    COLMAP's. Images are reduced to ``long_side`` px, never enlarged. Intact images of
     a killed run stay. Raises InputError for an unreadable image, an image without the proportions of its
     camera, or a panorama.
     """
@@ -75,7 +77,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     with reporter.task("reading frames", len(paths)) as task:
         todo = {path: frame for frame, path in pairs if not _is_intact(path, reporter)}
         task.update(done=len(paths) - len(todo))
-        for path, rgb in _pictures(todo):
+        for path, rgb in _pictures(todo, _gathered(capture, folder), long_side):
             if cut_out:
                 alpha = read_transparency(todo[path].path, upright=not is_as_stored(todo[path]))
                 assert alpha is not None  # `are_cut_outs`
@@ -146,16 +148,41 @@ def _is_intact(image: Path, reporter: Reporter) -> bool:
     return False
 
 
-def _pictures(frames: Mapping[Path, SourceFrame]) -> Iterator[tuple[Path, ImageU8]]:
-    """Yield the keys and pictures of ``frames``. Each video is decoded once."""
-    of_video: dict[Path, dict[int, Path]] = {}
+def neighbour_file(folder: Path, number: int) -> Path:
+    """Return the file of the pictures around the frame ``number`` of a video, see `neighbours.Gatherer`."""
+    return folder / "neighbours" / f"{number:06d}.npy"
+
+
+def _gathered(capture: Capture, folder: Path) -> dict[Path, Gatherer]:
+    """Return video -> gatherer of the pictures around its chosen frames that a killed run did not write."""
+    if capture.kind != "video":
+        return {}
+    make_folder(folder / "neighbours")
+    of_video: dict[Path, dict[Path, tuple[Neighbourhood, SourceFrame]]] = {}
+    for one in neighbourhoods(capture):
+        chosen, file = capture.frames[one.number], neighbour_file(folder, one.number)
+        if not file.exists():
+            of_video.setdefault(chosen.path, {})[file] = one, chosen
+    return {video: Gatherer(around) for video, around in of_video.items()}
+
+
+def _pictures(
+    frames: Mapping[Path, SourceFrame], gathered: Mapping[Path, Gatherer], long_side: int
+) -> Iterator[tuple[Path, ImageU8]]:
+    """Yield the keys and pictures of ``frames``. Each video is decoded once, also for ``gathered``."""
+    of_video: dict[Path, dict[int, Path]] = {video: {} for video in gathered}
     for key, frame in frames.items():
         if frame.pts is None:
             yield key, read_image(frame)
         else:
             of_video.setdefault(frame.path, {})[frame.pts] = key
     for video, keys in of_video.items():
-        yield from ((keys[pts], rgb) for pts, rgb in decode_frames(video, keys))
+        gatherer = gathered.get(video)
+        for pts, rgb, grey in decode_with_grey(video, keys, gatherer.stamps if gatherer else ()):
+            if gatherer and grey is not None:
+                gatherer.add(pts, reduced(grey, long_side))
+            if rgb is not None:
+                yield keys[pts], rgb
 
 
 def read_image(frame: SourceFrame) -> ImageU8:  # [H, W, 3]

@@ -115,27 +115,44 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, Image
 
     Raises InputError if a wanted frame cannot be decoded, or has too many pixels.
     """
-    missing = set(pts)
-    for number, frame, aspect in _decoded(path, pts):
-        missing.discard(number)
+    for number, rgb, _ in decode_with_grey(path, pts, ()):
+        if rgb is not None:
+            yield number, rgb
+
+
+def decode_with_grey(
+    path: Path, pts: Collection[int], grey: Collection[int]
+) -> Iterator[tuple[int, ImageU8 | None, ImageU8 | None]]:
+    """Decode ``path`` once and yield (pts, RGB [H, W, 3], grey [H, W]) of the frames ``pts`` and ``grey``.
+
+    RGB or grey is None where it is not wanted. Frames ``grey`` that cannot be decoded are left out. Raises
+    InputError as `decode_frames` does.
+    """
+    missing, in_grey = set(pts), set(grey)
+    for number, frame, aspect in _decoded(path, missing | in_grey):
         wide = max(1, round(aspect * frame.width))
-        _require_few(f"{path.name}: a frame would have", wide, frame.height, "square pixels")
-        yield number, _oriented(frame, wide)
+        rgb = None
+        if number in missing:
+            missing.discard(number)
+            _require_few(f"{path.name}: a frame would have", wide, frame.height, "square pixels")
+            rgb = _oriented(frame, wide)
+        yield number, rgb, _turned(_grey(frame), frame, wide) if number in in_grey else None
     if missing:
         raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
 
 
-def decode_grey(path: Path, pts: Collection[int], *, upright: bool = False) -> Iterator[tuple[int, ImageU8]]:
-    """Yield frames like `decode_frames`, but grey [H, W], and turned and stretched only if ``upright``.
+def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
+    """Yield frames like `decode_frames`, but grey [H, W], and neither turned nor stretched.
 
     It is several times as fast. Frames that cannot be decoded, for example at the start of a clip that was
     cut out of another, are left out.
     """
-    for number, frame, aspect in _decoded(path, pts):
-        grey = np.asarray(frame.to_ndarray(format="gray"), np.uint8)
-        if upright:
-            grey = _turned(grey, frame, max(1, round(aspect * frame.width)))
-        yield number, grey
+    for number, frame, _ in _decoded(path, pts):
+        yield number, _grey(frame)
+
+
+def _grey(frame: VideoFrame) -> ImageU8:  # [H, W]
+    return np.asarray(frame.to_ndarray(format="gray"), np.uint8)
 
 
 def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame, float]]:
