@@ -34,8 +34,9 @@ RETURN_PX = 0.5
 """Maximum distance, px, between a keypoint and the end of its track into a neighbour and back."""
 MIN_TRACKS = 20
 """Minimum number of tracks into a neighbour that counts."""
-STEPS, LEAST_PX = 8, 0.05
-"""Reweighted steps of a fit, and smallest scale of its weights, px."""
+STEPS, LEAST_PX, SETTLED_PX = 8, 0.05, 0.01
+"""Most reweighted steps of a fit, smallest scale of its weights, px, and motion of all tracks by a step, px,
+below which it was the last one."""
 SHARED_ERRORS = 250.0
 """Factor of the covariance for the errors that tracks share, such as those of the sparse points' depths. Chi
 squared per number was 200 to 960 (medians) in five tuning rooms without it."""
@@ -116,8 +117,10 @@ def spread_out(xy: ArrayF64, at_most: int = MAX_POINTS) -> NDArray[np.int64]:
     return np.sort(order[np.linspace(0, len(xy) - 1, min(at_most, len(xy))).astype(np.int64)])
 
 
-def measure(tracks: Tracks, readout: float = 0.0) -> MeasuredMotion | None:
+def measure(tracks: Tracks, readout: float = 0.0, *, brief: bool = False) -> MeasuredMotion | None:
     """Fit the path of the camera to ``tracks``; None if there are too few.
+
+    A ``brief`` fit takes half of the time. Its doubt is 0, and its covariance has no part of it.
 
     The first and the last frame of a video have neighbours on one side, and so a path of second order.
     ``readout`` is the time, s, from the first row's exposure to the last one's.
@@ -128,7 +131,7 @@ def measure(tracks: Tracks, readout: float = 0.0) -> MeasuredMotion | None:
     if not near:
         return None
     path, covariance, off = _fitted(tracks, used, readout)
-    closer, _, _ = _fitted(tracks, np.sort(near), readout)
+    closer = path if brief else _fitted(tracks, np.sort(near), readout)[0]
     _, derivatives = projected(tracks.points, np.zeros((len(tracks.points), TWIST)))
 
     def in_image(speed: ArrayF64) -> float:
@@ -168,9 +171,11 @@ def _fitted(
     there = _powers(tracks.times[which] + readout * tracks.rows[which, point], order)
     here = _powers(readout * tracks.rows[0, point], order)
     path = np.zeros((order, TWIST))
+    start, by_start = projected(points, np.zeros((len(points), TWIST)))
     for _ in range(STEPS):
         end, by_end = projected(points, np.einsum("mo,ot->mt", there, path))
-        start, by_start = projected(points, np.einsum("mo,ot->mt", here, path))
+        if readout:
+            start, by_start = projected(points, np.einsum("mo,ot->mt", here, path))
         left = moved - tracks.focal * (end - start)
         slopes = there[:, None, :, None] * by_end[:, :, None] - here[:, None, :, None] * by_start[:, :, None]
         slopes = tracks.focal * slopes.reshape(2 * len(left), order * TWIST)
@@ -183,7 +188,10 @@ def _fitted(
         inverse = np.linalg.inv(matrix / np.outer(size, size) + 1e-9 * np.eye(len(size)))
         inverse /= np.outer(size, size)
         side = weighted.T @ left.ravel()
-        path = path + np.einsum("ab,b->a", inverse, side).reshape(order, TWIST)
+        step = np.einsum("ab,b->a", inverse, side)
+        path = path + step.reshape(order, TWIST)
+        if np.abs(np.einsum("ma,a->m", slopes, step)).max() < SETTLED_PX:
+            break
     freedom = max(1.0, 2.0 * float(weight.sum()) - order * TWIST)
     variance = SHARED_ERRORS * float((weight * squared).sum()) / freedom
     whole = np.zeros((ORDER, TWIST))

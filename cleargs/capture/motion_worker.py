@@ -27,13 +27,13 @@ from cleargs.capture.motion_job import (
     MotionJob,
     MotionOutcome,
 )
-from cleargs.capture.readout import Geometry, Observations, Readout, adjusted, estimate
+from cleargs.capture.readout import Geometry, Observations, Readout, adjusted, estimate, fitted_readout
 from cleargs.files import atomic_path, write_json
 from cleargs.safe_io import read_json
 from cleargs.types import ArrayF64
 
 ROUNDS = 2
-"""Number of estimates of a readout. Each one measures the speeds with the readout of the one before."""
+"""Rounds of an adjustment to a readout. Each one measures the speeds with the geometry of the one before."""
 GOOD = 0.25
 """Quantile of the frames' tracking errors that is the error of a good frame. A frame counts 1 / (1 + e^2) for
 the readout, with e its error over that of a good frame: in shaky frames speeds are uncertain, and uncertain
@@ -123,15 +123,19 @@ class _Capture:
         self.motions: dict[str, MeasuredMotion] = {}
         self._measure()
 
-    def _measure(self) -> None:
-        """Measure the motion of all frames with the present geometry and readouts."""
+    def _measure(self, *, brief: bool = False) -> None:
+        """Measure the motion of all frames with the present geometry and readouts; see `measure`."""
         self.motions = {}
         for number, frame in enumerate(self._frames):
-            motion = self._motion(number, float(self._seconds[number]), bool(self._columns[number]))
+            columns = bool(self._columns[number])
+            motion = self._motion(number, float(self._seconds[number]), columns, brief=brief)
             if motion is not None:
                 self.motions[frame.image] = motion
 
-    def _motion(self, number: int, readout: float, columns: bool) -> MeasuredMotion | None:
+    def _motion(
+        self, number: int, readout: float, columns: bool, *, brief: bool = False
+    ) -> MeasuredMotion | None:
+        """Measure the motion of a frame; see `measure` for ``brief``."""
         frame, geometry = self._frames[number], self._geometry
         if frame.tracks is None or not len(frame.points):
             return None
@@ -149,60 +153,65 @@ class _Capture:
             frame.times,
             float(self._seen.focal[camera] * zoom),
         )
-        return measure(tracks, readout)
+        return measure(tracks, readout, brief=brief)
 
     def readouts(self) -> list[LensReadout]:
         """Return the readout times that hold, one per lens at most."""
         found = []
         for lens in dict.fromkeys(frame.lens for frame in self._frames):
-            tried = [(columns, self._readout(lens, columns)) for columns in (False, True)]
-            held = [(columns, readout) for columns, readout in tried if readout is not None and readout.holds]
-            if held:
-                columns, best = min(held, key=lambda pair: pair[1].rolled_px / pair[1].still_px)
-                found.append(
-                    LensReadout(
-                        lens=lens,
-                        seconds=best.seconds,
-                        interval=best.interval,
-                        columns=columns,
-                        still_px=best.still_px,
-                        rolled_px=best.rolled_px,
+            # The direction with the more certain readout is judged first, the other one if it does not hold.
+            seen = {columns: self._good(lens, columns, 0.0) for columns in (False, True)}
+            starts = {
+                columns: fitted_readout(good, self._geometry)
+                for columns, good in seen.items()
+                if good is not None
+            }
+            tried = [(columns, *start) for columns, start in starts.items() if start is not None]
+            for columns, start, _ in sorted(tried, key=lambda one: one[2] / abs(one[1].readout)):
+                readout = self._readout(lens, columns, start.readout)
+                if readout is not None and readout.holds:
+                    found.append(
+                        LensReadout(
+                            lens=lens,
+                            seconds=readout.seconds,
+                            interval=readout.interval,
+                            columns=columns,
+                            still_px=readout.still_px,
+                            rolled_px=readout.rolled_px,
+                        )
                     )
-                )
+                    break
         return found
 
-    def _readout(self, lens: int, columns: bool) -> Readout | None:
-        """Estimate the readout of a lens; None if it has too few good frames, or shows none."""
-        members = [n for n, frame in enumerate(self._frames) if frame.lens == lens]
-        found: Readout | None = None
-        for _ in range(ROUNDS):
-            readout = 0.0 if found is None else found.seconds
-            # Without a readout they are the motions that were measured at the start.
-            motions = {
-                n: self.motions.get(self._frames[n].image)
-                if found is None
-                else self._motion(n, readout, columns)
-                for n in members
-                if self._frames[n].two_sided
-            }
-            errors = [motion.error_px for motion in motions.values() if motion is not None]
-            known = {n: motion for n, motion in motions.items() if motion is not None}
-            if len(known) < MIN_FRAMES:
-                return None
-            good = max(float(np.quantile(errors, GOOD)), MIN_ERROR_PX)
-            trust = np.zeros(len(self._frames))
-            for n, motion in known.items():
-                trust[n] = 1.0 / (1.0 + (motion.error_px / good) ** 2)
-            seen = replace(self._with_paths(known, columns), trust=trust).select(
-                trust[self._seen.frame] > 0.0
-            )
-            every = max(1, len(seen.point) // MAX_OBSERVATIONS)
-            # Kept-out points are every tenth one, so points are left out by another rule.
-            seen = seen.select(seen.point // 16 % every == 0)
-            found = estimate(seen, replace(self._geometry, readout=readout))
-            if found is None:
-                return None
-        return found
+    def _readout(self, lens: int, columns: bool, start: float) -> Readout | None:
+        """Estimate the readout of a lens with speeds that are measured with the readout ``start``, s."""
+        seen = self._good(lens, columns, start)
+        return None if seen is None else estimate(seen, replace(self._geometry, readout=start))
+
+    def _good(self, lens: int, columns: bool, readout: float) -> Observations | None:
+        """Return the keypoints of the frames of a lens, with paths by ``readout``; None: too few are good."""
+        motions = {}
+        for n, frame in enumerate(self._frames):
+            if frame.lens == lens and frame.two_sided:
+                # Without a readout they are the motions that were measured at the start.
+                motion = (
+                    self._motion(n, readout, columns, brief=True)
+                    if readout
+                    else self.motions.get(frame.image)
+                )
+                if motion is not None:
+                    motions[n] = motion
+        if len(motions) < MIN_FRAMES:
+            return None
+        errors = [motion.error_px for motion in motions.values()]
+        good = max(float(np.quantile(errors, GOOD)), MIN_ERROR_PX)
+        trust = np.zeros(len(self._frames))
+        for n, motion in motions.items():
+            trust[n] = 1.0 / (1.0 + (motion.error_px / good) ** 2)
+        seen = replace(self._with_paths(motions, columns), trust=trust).select(trust[self._seen.frame] > 0.0)
+        every = max(1, len(seen.point) // MAX_OBSERVATIONS)
+        # Kept-out points are every tenth one, so points are left out by another rule.
+        return seen.select(seen.point // 16 % every == 0)
 
     def _with_paths(self, motions: Mapping[int, MeasuredMotion], columns: bool) -> Observations:
         paths = np.zeros_like(self._seen.paths)
@@ -227,7 +236,7 @@ class _Capture:
         self._seconds = np.array([0.0 if found is None else found.seconds for found in known])
         self._columns = np.array([found is not None and found.columns for found in known])
         for _ in range(ROUNDS):
-            self._measure()
+            self._measure(brief=True)
             numbers = {
                 n: self.motions[f.image] for n, f in enumerate(self._frames) if f.image in self.motions
             }

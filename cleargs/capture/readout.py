@@ -112,17 +112,25 @@ class Readout:
         return alike and self.rolled_px <= (1.0 - MIN_GAIN) * self.still_px
 
 
-def estimate(seen: Observations, start: Geometry) -> Readout | None:
-    """Estimate the readout time from the frames of ``seen``, which share one lens and have measured paths.
+def fitted_readout(seen: Observations, start: Geometry) -> tuple[Geometry, float] | None:
+    """Return the geometry with the readout time that fits ``seen`` best, and its standard error, s.
 
-    Returns None if its interval contains zero.
+    The frames share one lens and have measured paths. Returns None if the interval of 95 % contains zero.
     """
-    kept_out = seen.point % KEPT_OUT == 0
-    fitted, judge = seen.select(~kept_out), seen.select(kept_out)
+    fitted = seen.select(seen.point % KEPT_OUT != 0)
     rolled = adjusted(fitted, start, shutter=True)
     error = _Step(fitted, rolled, shutter=True).standard_error
-    if abs(rolled.readout) <= WITHIN * error:
+    return None if abs(rolled.readout) <= WITHIN * error else (rolled, error)
+
+
+def estimate(seen: Observations, start: Geometry) -> Readout | None:
+    """Estimate the readout time as `fitted_readout`, and judge it by both halves and the kept-out points."""
+    found = fitted_readout(seen, start)
+    if found is None:
         return None
+    rolled, error = found
+    kept_out = seen.point % KEPT_OUT == 0
+    fitted, judge = seen.select(~kept_out), seen.select(kept_out)
     still = adjusted(fitted, replace(start, readout=0.0))
     frames = np.unique(seen.frame)
     early = fitted.frame < frames[len(frames) // 2]
