@@ -5,13 +5,20 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.database import frames_with_few_features, remove_features
+from cleargs.capture.database import (
+    copy_features,
+    create_database,
+    frames_with_few_features,
+    remove_database,
+    remove_features,
+)
 from cleargs.capture.matching import loop_pairs, match_pairs, sequential_pairs
 from cleargs.capture.sfm_job import Job
 
@@ -72,20 +79,47 @@ class Features:
         again = "" if settings == FIRST else " again"
         self._report(phase=f"finding features{again}", total=len(names))
         size = 4 * job.threads
+        faint = copy.deepcopy(options)
+        faint.sift.peak_threshold = _FAINT
+
+        def find(where: Path, which: Sequence[str], how: pycolmap.FeatureExtractionOptions) -> None:
+            if which:
+                pycolmap.extract_features(
+                    where, job.images, image_names=which, reader_options=reader, extraction_options=how
+                )
+
+        few_before = False
         for start in range(0, len(names), size):
             block = list(names[start : start + size])
-            pycolmap.extract_features(
-                database, job.images, image_names=block, reader_options=reader, extraction_options=options
-            )
-            few = frames_with_few_features(database, block, limit)
+            # A frame with few features down to the fainter contrast has few down to the usual one, too. So
+            # after a block with few in all its frames, the fainter ones are found first.
+            known = self._few_faint(database, block, limit, partial(find, how=faint)) if few_before else set()
+            rest = [name for name in block if name not in known]
+            find(database, rest, options)
+            few = frames_with_few_features(database, rest, limit)
             if few:
                 remove_features(database, few.values())
-                faint = copy.deepcopy(options)
-                faint.sift.peak_threshold = _FAINT
-                pycolmap.extract_features(
-                    database, job.images, image_names=[*few], reader_options=reader, extraction_options=faint
-                )
+                find(database, [*few], faint)
+            few_before = len(few) + len(known) == len(block)
             self._report(done=start + len(block))
+
+    def _few_faint(
+        self, database: Path, block: Sequence[str], limit: float, find: Callable[[Path, Sequence[str]], None]
+    ) -> set[str]:
+        """Write the fainter features of the frames in ``block`` that have few of them to ``database``.
+
+        Returns the names of these frames. ``find`` finds features. It works in a copy, so that a killed run
+        leaves no fainter features in frames with many.
+        """
+        scratch = database.with_name(f"{database.stem}-faint.db")
+        create_database(scratch, self.job)
+        find(scratch, block)
+        few = frames_with_few_features(scratch, block, limit)
+        many = frames_with_few_features(scratch, [name for name in block if name not in few], np.inf)
+        remove_features(scratch, many.values())
+        copy_features(scratch, database)
+        remove_database(scratch)
+        return set(few)
 
     def match(self, database: Path, pairs: Sequence[tuple[int, int]], again: str = "") -> None:
         """Match the features of ``pairs`` and keep the verified matches in ``database``."""
