@@ -144,9 +144,14 @@ class Adjuster:
         return self._triangulate(model, self._cut)
 
 
-def adjust_all(model: pycolmap.Reconstruction, *, cameras: bool = True) -> None:
-    """Adjust poses, points and, with ``cameras``, lenses of ``model`` in one bundle adjustment."""
-    options = pycolmap.BundleAdjustmentOptions(refine_focal_length=cameras, refine_extra_params=cameras)
+def adjust_all(model: pycolmap.Reconstruction, *, cameras: bool = True, focal: bool = True) -> None:
+    """Adjust poses, points and, with ``cameras``, lenses of ``model`` in one bundle adjustment.
+
+    Without ``focal``, the focal lengths stay.
+    """
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=cameras and focal, refine_extra_params=cameras
+    )
     options.print_summary = False
     # A robust loss, because some matches are still wrong.
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -45,6 +46,10 @@ START_FOCALS = (0.25, 0.3, 0.36, 0.43, 0.52, 0.62, 0.75, 0.9, 1.2, 1.8, 3.0)
 """Focal lengths, in long sides, that a search tries."""
 FISHEYE_AHEAD = 1.03
 """A fisheye is tried if this number of times as many matches fit one as fit a perspective lens."""
+STRAIGHT, ALIKE_FOCALS = 0.05, 1.15
+"""Largest distortion at the corners, a share of their distance from the centre, of a lens that cannot be a
+fisheye: one of 40 degrees from corner to corner has 4 %. Largest ratio of two focal lengths from which
+reconstructions end alike."""
 SEARCHED_PAIRS, MIN_MATCHES, MAX_MATCHES, SEARCH_PX = 12, 60, 250, 1.0
 """Most pairs of frames of a search, fewest and most matches of a pair, and distance of a match that fits."""
 
@@ -71,7 +76,7 @@ class Fit:
     judged: pycolmap.Reconstruction
     """The model itself, or the same model adjusted without the tracks that ``adjuster`` keeps out."""
 
-    @property
+    @cached_property
     def errors(self) -> ArrayF64:
         """Errors of the kept-out keypoints, px; see `prediction_errors`."""
         return prediction_errors(self.adjuster.tracks, self.judged)
@@ -89,7 +94,7 @@ class Fit:
         return median <= GAIN * middle and mean <= before
 
     def _errors_of(self, model: pycolmap.Reconstruction) -> tuple[float, float]:  # mean, median
-        errors = prediction_errors(self.adjuster.tracks, model)
+        errors = self.errors if model is self.judged else prediction_errors(self.adjuster.tracks, model)
         known = np.minimum(errors[~np.isnan(errors)], CAPPED_PX)
         return (float(known.mean()), float(np.median(known))) if len(known) else (CAPPED_PX, CAPPED_PX)
 
@@ -100,6 +105,19 @@ class Fit:
         known = errors[~np.isnan(errors)]
         few = len(known) > 0 and float((known < WITHIN_PX).mean()) < DOUBTFUL
         return few or any(map(is_impossible, self.judged.cameras.values()))
+
+    @property
+    def is_straight(self) -> bool:
+        """True if the lens of all frames is `STRAIGHT`, so that no fisheye took the pictures."""
+        return max(map(distortion, self.judged.cameras.values())) <= STRAIGHT
+
+    def has_focal(self, share: float) -> bool:
+        """Return True if the lens of all frames has about this focal length, in long sides."""
+        return all(
+            abs(np.log(camera.mean_focal_length() / max(camera.width, camera.height) / share))
+            <= np.log(ALIKE_FOCALS)
+            for camera in self.judged.cameras.values()
+        )
 
     def predictions(self) -> tuple[Prediction | None, dict[str, Prediction]]:
         """Return the figure of the capture, and that of each image by its name."""
@@ -123,6 +141,17 @@ def is_impossible(camera: pycolmap.Camera) -> bool:
     share = camera.mean_focal_length() / max(camera.width, camera.height)
     stated = camera.has_prior_focal_length
     return max(fx, fy) > MAX_ASPECT * min(fx, fy) or not (stated or MIN_FOCAL <= share <= MAX_FOCAL)
+
+
+def distortion(camera: pycolmap.Camera) -> float:
+    """Return how far the corners are from their places without distortion, as a share; infinity: no ray."""
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
+    rays = np.asarray(camera.cam_from_img(corners), np.float64).reshape(-1, 2)
+    focal = np.array([camera.focal_length_x, camera.focal_length_y])
+    centre = np.array([camera.principal_point_x, camera.principal_point_y])
+    straight = np.linalg.norm(rays * focal, axis=1)
+    away = np.abs(np.linalg.norm(corners - centre, axis=1) / np.maximum(straight, 1e-12) - 1.0)
+    return float(np.where(np.isfinite(away), away, np.inf).max())
 
 
 def fitted(sfm: Steps, model: pycolmap.Reconstruction, like: Adjuster | None = None) -> Fit:

@@ -35,7 +35,9 @@ from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import (
     GOOD_SHARE,
     LEAST_SHARE,
+    LITTLE_DEPTH,
     MIN_KEYPOINTS,
+    MOVE,
     NO_DEPTH,
     OUTCOME,
     OWN,
@@ -147,8 +149,15 @@ def reconstruct(
                 "give each part alone (--start and --end, or --only)"
             )
         else:
-            _check_registered(len(model.images), len(frames), config, reporter)
+            _check_registered(len(model.images), len(frames), config, reporter, outcome)
         report_lens(model, frames, config, len(job.cameras), reporter)
+        if outcome.focal_open:
+            (lens,) = model.cameras.values()
+            reporter.warn(
+                "all frames look the same way, which leaves the focal length open: "
+                f"{lens.focal[0]:.0f} px are assumed, and depths are as wrong as they are. State the focal "
+                "length (ingest.focal), or film from other angles, too"
+            )
         if outcome.shifts_px:
             reach = max(abs(shift) for pair in outcome.shifts_px.values() for shift in pair)
             reporter.warn(
@@ -161,7 +170,7 @@ def reconstruct(
                 "use more frames (ingest.max_frames), or leave one part out"
             )
         return _normalised(model, None, outcome)
-    _check_registered(len(posed), len(frames), config, reporter)
+    _check_registered(len(posed), len(frames), config, reporter, SfmOutcome())
     worlds = _conventions(list(poses.values()), others=given is None)
     world, _ = worlds[OWN]
     if given is not None:
@@ -211,13 +220,14 @@ def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -
         f"of {found.keypoints} keypoints that took no part in the fit, {found.share:.0%} are within 2 px of "
         f"their places (median {found.median_px:.2g} px)"
     )
+    doubt = _advice(outcome, _DOUBT)
     if found.share < LEAST_SHARE and outcome.method == "sfm":
-        raise StageError(f"the cameras are wrong: {figure}", hint=_DOUBT)
+        raise StageError(f"the cameras are wrong: {figure}", hint=doubt)
     kept = outcome.method == "given" and (outcome.missed_px or 0.0) <= config.refine_above
     if found.share < GOOD_SHARE and kept:
         reporter.warn(f"the poses of the input are doubtful: {figure}; ingest.refine_above keeps them")
     elif found.share < GOOD_SHARE:
-        return (f"cameras that the images confirm: {figure}, fewer than {GOOD_SHARE:.0%}; {_DOUBT}",)
+        return (f"cameras that the images confirm: {figure}, fewer than {GOOD_SHARE:.0%}; {doubt}",)
     else:
         reporter.info(f"cameras: {figure}")
     return ()
@@ -280,17 +290,27 @@ def _found(
 ) -> tuple[SparseModel, SfmOutcome]:
     """Return the model of `_run`. Raises StageError if it has too few frames."""
     model, outcome = _run(job, reporter, known)
-    _require_registered(len(model.images), len(job.names), job.config)
+    _require_registered(len(model.images), len(job.names), job.config, outcome)
     return model, outcome
 
 
-def _require_registered(registered: int, total: int, config: SfmConfig) -> None:
-    if registered < max(3, config.min_registered * total):
-        raise StageError(f"only {registered} of {total} frames could be placed in space", hint=_ADVICE)
+def _advice(outcome: SfmOutcome, usual: str = _ADVICE) -> str:
+    """Return what to do if frames could not be placed, or were placed wrongly."""
+    return f"{LITTLE_DEPTH}. {MOVE.capitalize()}" if outcome.little_depth else usual
 
 
-def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
-    _require_registered(registered, total, config)
+def _require_registered(registered: int, total: int, config: SfmConfig, outcome: SfmOutcome) -> None:
+    """Raise StageError if too few frames have a pose. Few are enough only if the frames show depth."""
+    few = registered < WARN_REGISTERED * total and outcome.little_depth
+    if few or registered < max(3, config.min_registered * total):
+        text = f"only {registered} of {total} frames could be placed in space"
+        raise StageError(text, hint=_advice(outcome))
+
+
+def _check_registered(
+    registered: int, total: int, config: SfmConfig, reporter: Reporter, outcome: SfmOutcome
+) -> None:
+    _require_registered(registered, total, config, outcome)
     if registered < WARN_REGISTERED * total:
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
 

@@ -19,8 +19,9 @@ NO_DEPTH = (
     "the frames show no depth: the camera only turned or zoomed on one spot, or all that it shows is flat "
     "(a homography explains the matches of distant frames)"
 )
+LITTLE_DEPTH = "the frames show little depth: the camera moved too little"
 MOVE = "move, do not only turn: walk around the subject, sideways, with things at different distances in view"
-"""Cause and remedy if no frames differ by parallax (`cleargs.capture.parallax`)."""
+"""Causes and remedy if no frames, or few, differ by parallax (`cleargs.capture.parallax`)."""
 
 OUTCOME = "outcome.json"
 """File in the folder of a model, with its `SfmOutcome`."""
@@ -82,6 +83,10 @@ class SfmOutcome(FrozenModel):
     """The same by working image."""
     lens: str = ""
     """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
+    focal_open: bool = False
+    """True if the cameras look the same way, and their focal length is assumed (`capture.unturned`)."""
+    little_depth: bool = False
+    """True if few pairs of frames show depth (`parallax.LITTLE_BELOW`)."""
     shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)
     """Working image -> shift of its picture by a stabiliser, px; empty: none was found."""
     elsewhere: Sequence[str] = ()

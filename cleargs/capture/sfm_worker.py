@@ -43,11 +43,12 @@ from cleargs.capture.kept_out import (
     weakest_join,
 )
 from cleargs.capture.lenses import FISHEYE_AHEAD, GAIN, Fit, fitted, searched
-from cleargs.capture.parallax import shows_depth
+from cleargs.capture.parallax import LITTLE_BELOW, NO_DEPTH_BELOW, depth_share
 from cleargs.capture.prediction import scales_differ
 from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
-from cleargs.capture.sfm_job import MOVE, NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import LITTLE_DEPTH, MOVE, NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
 from cleargs.capture.steady import steadied
+from cleargs.capture.unturned import TURNED, USUAL_FOCAL, refocused, turned
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
@@ -143,7 +144,8 @@ class Sfm(Features):
         Another kind of lens, with a focal length that is searched, is tried if these tracks contradict the
         cameras, or if no lens has such a focal length.
         """
-        if not shows_depth(self.database):
+        deep = depth_share(self.database)
+        if deep <= NO_DEPTH_BELOW:
             raise StageError(NO_DEPTH, hint=MOVE)
         tried = self
         if self.job.config.camera_model == FISHEYE:
@@ -158,24 +160,23 @@ class Sfm(Features):
             fit = fitted(tried, model)
         except StageError as error:
             failed = error
-        if self.job.config.camera_model == "auto":
-            kind, share, ahead = self._searched(FISHEYE, "SIMPLE_PINHOLE")
-            if fit is None or fit.doubtful or (kind == FISHEYE and ahead >= FISHEYE_AHEAD):
-                self._report(phase="trying another lens", total=None)
-                other = self._with_lens(kind, share)
-                try:
-                    model, others = other.mapped(pairs)
-                    again = fitted(other, model, None if fit is None else fit.adjuster)
-                    whole = fit is None or model.num_reg_images() >= fit.model.num_reg_images()
-                    if fit is None or (
-                        whole and fit.error_of(again.judged) <= GAIN * fit.error_of(fit.judged)
-                    ):
-                        tried, fit, placed = other, again, others
-                except StageError as error:
-                    failed = failed or error
+        other = self._other_lens(fit) if self.job.config.camera_model == "auto" else None
+        if other is not None:
+            self._report(phase="trying another lens", total=None)
+            try:
+                model, others = other.mapped(pairs)
+                again = fitted(other, model, None if fit is None else fit.adjuster)
+                whole = fit is None or model.num_reg_images() >= fit.model.num_reg_images()
+                if fit is None or (whole and fit.error_of(again.judged) <= GAIN * fit.error_of(fit.judged)):
+                    tried, fit, placed = other, again, others
+            except StageError as error:
+                failed = failed or error
         if fit is None:
             assert failed is not None
+            if deep <= LITTLE_BELOW:
+                raise StageError(f"{failed}: {LITTLE_DEPTH}", hint=MOVE)
             raise failed
+        fit, focal_open = self._with_focal(fit)
         model, shifts = steadied(fit.model, adjust_all)
         # The kept-out tracks have no shift, so they say nothing about the cameras of a stabilised video.
         figure, figures = (None, {}) if shifts else fit.predictions()
@@ -187,11 +188,42 @@ class Sfm(Features):
             lens=lens_of(model),
             torn_at=join - 1 if torn else None,
             elsewhere=sorted(tried._elsewhere - _names_in(model)),
+            focal_open=focal_open,
+            little_depth=deep <= LITTLE_BELOW,
             shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
             prediction=figure,
             predictions=figures,
         )
         return model, outcome
+
+    def _with_focal(self, fit: Fit) -> tuple[Fit, bool]:
+        """Return ``fit`` with the stated or the usual focal length if its cameras look the same way.
+
+        Also returns True if the focal length is open, and nobody states it.
+        """
+        camera = colmap_cameras(self.job)[0]
+        if len(fit.model.cameras) > 1 or lens_of(fit.model) == FISHEYE or turned(fit.model) >= TURNED:
+            return fit, False
+        stated = camera.has_prior_focal_length
+        focal = camera.mean_focal_length() if stated else USUAL_FOCAL * max(camera.width, camera.height)
+        model = refocused(fit.model, focal)
+        judged = model if fit.judged is fit.model else refocused(fit.judged, focal)
+        return Fit(model, fit.adjuster, judged), not stated
+
+    def _other_lens(self, fit: Fit | None) -> Sfm | None:
+        """Return the steps with another lens that may explain the matches better than ``fit`` does, or None.
+
+        The search takes a second, so a lens without distortion that predicts the kept-out tracks is not
+        doubted. From about the same focal length, mapping ends alike.
+        """
+        if fit is not None and not fit.doubtful and fit.is_straight:
+            return None
+        kind, share, ahead = self._searched(FISHEYE, "SIMPLE_PINHOLE")
+        if fit is not None and not (kind == FISHEYE and ahead >= FISHEYE_AHEAD):
+            alike = kind != FISHEYE and fit.has_focal(share)
+            if alike or not fit.doubtful:
+                return None
+        return self._with_lens(kind, share)
 
     def _searched(self, *kinds: str) -> tuple[str, float, float]:
         """Return the kind of lens that most matches fit, its focal length in long sides, and by how much.

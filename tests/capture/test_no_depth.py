@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.parallax import pairs_with_depth, shows_depth
+from cleargs.capture.config import SfmConfig
+from cleargs.capture.parallax import LITTLE_BELOW, depth_share, pairs_with_depth
+from cleargs.capture.sfm import _require_registered
+from cleargs.capture.sfm_job import SfmOutcome
 from cleargs.errors import StageError
 from cleargs.synth.optics import Lens, phone_lens
 from cleargs.synth.room import make_room
@@ -67,6 +70,23 @@ def test_a_room_that_is_seen_from_one_spot_is_refused(tmp_path: Path, ingest: In
 
 
 @pytest.mark.slow
+def test_a_pan_whose_camera_trembles_is_refused(tmp_path: Path, ingest: Ingest) -> None:
+    """A tremble of 1 cm shows depth in a tenth of the pairs, and half of the frames are placed wrongly."""
+    trembled = pan(10, 60, tilt=8)
+    trembled[:, :, 3] += np.random.default_rng(0).normal(0, 0.01 / np.sqrt(3), (10, 3))
+    with pytest.raises(StageError) as caught:
+        ingest(write(tmp_path / "in", film(make_room(2), trembled, [LENS] * 10)))
+    assert "move, do not only turn" in str(caught.value.hint).lower()
+
+
+def test_few_frames_are_enough_only_with_depth() -> None:
+    _require_registered(6, 14, SfmConfig(), SfmOutcome())
+    with pytest.raises(StageError, match="only 6 of 14") as caught:
+        _require_registered(6, 14, SfmConfig(), SfmOutcome(little_depth=True))
+    assert "move, do not only turn" in str(caught.value.hint).lower()
+
+
+@pytest.mark.slow
 def test_a_walk_with_a_pan_passes_and_the_pan_is_placed(tmp_path: Path, ingest: Ingest) -> None:
     steps = walk(2, 14)
     turns = [
@@ -105,4 +125,4 @@ def test_a_walk_whose_distant_views_share_one_wall_only_shows_depth(tmp_path: Pa
                 opened.write_two_view_geometry(one + 1, two + 1, geometry)
     deep, judged = pairs_with_depth(tmp_path / "matches.db")
     assert judged >= 12 and deep >= 0.3 * judged
-    assert shows_depth(tmp_path / "matches.db")
+    assert depth_share(tmp_path / "matches.db") > LITTLE_BELOW
