@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 
+import click
 from rich.console import Console
 from rich.table import Table
 
@@ -38,7 +39,10 @@ def print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", w
         column.min_width = max(column.min_width or 0, *map(len, parts))
         least += column.min_width
     console.width = max(console.width, least + gap[1] * (len(table.columns) - 1))
-    console.print(table)
+    with console.capture() as printed:
+        console.print(table)
+    for line in printed.get().splitlines():  # in a narrow terminal, spaces at the end would fill another line
+        click.echo(line.rstrip())
 
 
 def _words(text: str) -> list[str]:

@@ -232,3 +232,4 @@ def test_show_wraps_labels_and_cuts_no_value(
     print_table([["  triangulating", "0.6", "#" * 20]], "part of the time", "seconds", "")
     out = capsys.readouterr().out
     assert "  triangulating" in out and "#" * 20 in out, out
+    assert all(line == line.rstrip() for line in out.splitlines()), out
