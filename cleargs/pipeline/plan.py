@@ -304,8 +304,11 @@ def rerun_lines(plans: list[StagePlan]) -> list[str]:
 
 
 def cost_line(plans: list[StagePlan]) -> str:
-    """Return one line with the expected time, memory and disk, and the time of each stage with work to do."""
-    costs = [(plan.stage, plan.estimate) for plan in plans if plan.estimate is not None]
+    """Return one line with the expected time, memory and disk, and the time of each stage with work to do.
+
+    It is empty if no stage has work: those that make no repairs take no time.
+    """
+    costs = [(plan.stage, plan.estimate) for plan in plans if plan.estimate and plan.estimate.minutes]
     if not costs:
         return ""
     whole = Estimate(
@@ -313,7 +316,7 @@ def cost_line(plans: list[StagePlan]) -> str:
         max(cost.memory_gb for _, cost in costs),
         sum(cost.disk_gb for _, cost in costs),
     )
-    stages = ", ".join(f"{stage} {_time(cost.minutes)}" for stage, cost in costs if cost.minutes)
+    stages = ", ".join(f"{stage} {_time(cost.minutes)}" for stage, cost in costs)
     return f"estimate: about {cost_text(whole)} ({stages})"
 
 

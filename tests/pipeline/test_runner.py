@@ -18,7 +18,7 @@ from cleargs.errors import InputError, StageError, StoreError
 from cleargs.files import write_json
 from cleargs.manifest import MANIFEST, read_manifest, write_manifest
 from cleargs.parquet import column, table_meanings, write_table
-from cleargs.pipeline.plan import Planner
+from cleargs.pipeline.plan import Planner, StagePlan, cost_line
 from cleargs.pipeline.runner import Runner, check_same_input
 from cleargs.pipeline.stage import Estimate
 from cleargs.pipeline.stages import Stages
@@ -324,6 +324,12 @@ def test_stages_without_work_are_not_reported(bench: Bench, monkeypatch: pytest.
     assert (bench.folder / "total").exists()
     told = [line for line in bench.remarks.lines if "total" in line or "estimate" in line]
     assert [line.partition(":")[0] for line in told] == ["estimate", "new estimate"]
+
+
+def test_there_is_no_estimate_without_work() -> None:
+    """The status of a finished draft ended with "estimate: about 0 s, 1.0 GB memory, 0 MB disk ()"."""
+    nothing = Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
+    assert cost_line([StagePlan("rivr", "missing", (), nothing)]) == ""
 
 
 def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_path: Path) -> None:
