@@ -58,6 +58,8 @@ _REDUCED = 0.75  # share of the long side up to which a folder with the names of
 LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
 """Files and folders with poses, by which a folder is a capture."""
 
+WHITE, MASK_SHARE = 255, 0.95
+"""Level of white, and least share of black and white pixels in a mask; edges may be smooth."""
 MASKS, DEPTH, GREY, INFRARED = "mask%s", "depth map%s", "picture%s of one channel", "infrared picture%s"
 ALONE = "mask%s without a photograph of the same name"
 BELOW = "video%s in folders below"
@@ -207,7 +209,11 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     for kind, names in ((SPOT, SPOT_NAME), (INFRARED, INFRARED_NAME)):
         left_out[kind] = _by_name(names, headers, root)
         headers = {path: headers[path] for path in _without([*headers], left_out[kind])}
-    images, deep, left_out[GREY] = _by_channels(headers)
+    beside = _masks_beside(headers)
+    left_out[MASKS] = [*left_out[MASKS], *beside]
+    images, deep, left_out[GREY] = _by_channels(
+        {path: headers[path] for path in _without([*headers], beside)}
+    )
     left_out[DEEP_TIFF] = [path for path in deep if path.suffix.lower() in (".tif", ".tiff")]
     left_out[DEPTH] = _without(deep, left_out[DEEP_TIFF])
     left_out[BANDS] = _other_bands([path for path in images if _is_grey(headers[path])])
@@ -284,6 +290,39 @@ def _masks(images: Sequence[Path], root: Path) -> list[Path]:
         if _mask_folder(path, root) or (unmasked(path) != path.with_suffix("") and unmasked(path) in stems)
     ]
     return masks if len(masks) < len(images) else []
+
+
+def _masks_beside(headers: Mapping[Path, Header | None]) -> list[Path]:
+    """Return the PNG files that are masks of a photograph of the same stem and size in their folder.
+
+    The first one of each folder decides.
+    """
+    shots = {p.with_suffix(""): p for p, header in headers.items() if p.suffix.lower() in (".jpg", ".jpeg")}
+    masks: dict[Path, list[Path]] = defaultdict(list)
+    for path, header in headers.items():
+        shot = headers.get(shots.get(path.with_suffix(""), path))
+        if (
+            path.suffix.lower() == ".png"
+            and header
+            and shot
+            and header is not shot
+            and header.size == shot.size
+        ):
+            masks[path.parent].append(path)
+    return [path for paths in masks.values() if _looks_like_a_mask(paths[0]) for path in paths]
+
+
+def _looks_like_a_mask(path: Path) -> bool:
+    """Return True for a picture in black and white, or one whose pixels are white where it is opaque."""
+    from cleargs.media.image import read_alpha, read_grey
+
+    try:
+        levels, alpha = read_grey(path), read_alpha(path, upright=False)
+    except InputError:
+        return False
+    if alpha is not None and not alpha.all():
+        return bool((levels[alpha > 0] == WHITE).all())
+    return bool(((levels == 0) | (levels == WHITE)).mean() > MASK_SHARE)
 
 
 def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:

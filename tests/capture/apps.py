@@ -208,6 +208,24 @@ def masks_beside(root: Path, pictures: Pictures, poses: Poses) -> None:
         save(root / f"{index:04d}_mask.png", mask if index % 2 else cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
 
 
+def masks_of_the_same_stem(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """Masks in black and white with the names of their photographs."""
+    for index, picture in enumerate(pictures):
+        save(root / f"{index:04d}.jpg", picture)
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:60] = 0
+        save(root / f"{index:04d}.png", mask)
+
+
+def white_masks_of_the_same_stem(root: Path, pictures: Pictures, poses: Poses) -> None:
+    """The same as white pictures with the mask in their alpha."""
+    for index, picture in enumerate(pictures):
+        save(root / f"{index:04d}.jpg", picture)
+        mask = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+        mask[:60, :, 3] = 0
+        save(root / f"{index:04d}.png", mask)
+
+
 def previews_at_the_top(root: Path, pictures: Pictures, poses: Poses) -> None:
     for index, picture in enumerate(pictures):
         save(root / f"shots/{index:04d}.jpg", picture)

@@ -183,8 +183,11 @@ def test_damaged_poses_of_apps(tmp_path: Path, frames: Frames, app: str, file: s
     assert not open_capture(root, IngestConfig(poses="sfm")).notes
 
 
-def test_masks_beside_their_photographs_are_used(tmp_path: Path, frames: Frames) -> None:
-    root = write(apps.masks_beside, tmp_path / "capture", frames)
+@pytest.mark.parametrize(
+    "app", [apps.masks_beside, apps.masks_of_the_same_stem, apps.white_masks_of_the_same_stem]
+)
+def test_masks_beside_their_photographs_are_used(tmp_path: Path, frames: Frames, app: apps.Writer) -> None:
+    root = write(app, tmp_path / "capture", frames)
     for frame in open_capture(root, IngestConfig()).frames:
         source_mask = read_source_mask(frame)
         assert source_mask is not None and not source_mask[:60].any() and source_mask[60:].all()
