@@ -9,6 +9,8 @@ import cv2
 
 import cleargs as cg
 
+if len(sys.argv) != 4:
+    sys.exit(__doc__)
 folder, frame_id, output = sys.argv[1:]
 found = cg.deblur(cg.open_run(folder), int(frame_id))
 if found is None:

@@ -8,6 +8,8 @@ import sys
 import cleargs as cg
 from cleargs.evaluate.config import EvalOptions
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 folder, reference = sys.argv[1:]
 run = cg.open_run(folder)
 options = EvalOptions(lpips=(), scorers=("clarity-net",))

@@ -10,6 +10,8 @@ import cv2
 
 import cleargs as cg
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 folder, output = sys.argv[1:]
 frames = sorted(path for path in Path(folder).iterdir() if path.suffix in (".png", ".jpg"))
 table = cg.score_frames(frames)

@@ -7,6 +7,8 @@ import sys
 
 import cleargs as cg
 
+if len(sys.argv) not in (3, 4):
+    sys.exit(__doc__)
 capture, folder, *recipe = sys.argv[1:]
 run = cg.run(capture, folder, recipe=recipe[0] if recipe else None, progress=print)
 for stage in run.stages:

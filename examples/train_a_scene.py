@@ -7,6 +7,8 @@ import sys
 
 import cleargs as cg
 
+if len(sys.argv) not in (3, 4):
+    sys.exit(__doc__)
 folder, output, *steps = sys.argv[1:]
 run = cg.open_run(folder)
 capture = cg.open_prepared(run["ingest"])

@@ -43,6 +43,8 @@ _LABELS = {
 }
 EXPOSURES_DIFFER = 0.5
 """Gain of PSNR by aligned colours, dB, above which the gain is printed."""
+SMALLEST_SHARE = 5e-4
+"""Least share of the pixels in a region whose PSNR is printed. That of fewer says nothing."""
 
 OPAQUE_DB = 45
 """PSNR between a scene over two backgrounds, dB, above which the background is not visible."""
@@ -323,7 +325,7 @@ def _regions(evaluation: Evaluation) -> list[str]:
     lines = [
         f"{name}: {_figure('psnr', part.psnr)} dB on {part.share:.1%} of the pixels"
         for name, part in parts.items()
-        if part is not None and part.psnr is not None
+        if part is not None and part.psnr is not None and part.share >= SMALLEST_SHARE
     ]
     if evaluation.psnr_white is not None:
         lines.append(f"over white: {evaluation.psnr_white:.2f} dB")
