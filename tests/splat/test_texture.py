@@ -99,8 +99,8 @@ def test_crops_fit_and_follow_the_seed() -> None:
 
 def test_term_is_in_the_last_part_of_the_schedule() -> None:
     """Also if another training continues the schedule."""
-    whole = Schedule(TrainConfig(steps=100), 1)
-    part = Schedule(TrainConfig(steps=50, begin=0.5), 1)
+    whole = Schedule(TrainConfig(steps=100))
+    part = Schedule(TrainConfig(steps=50, begin=0.5))
     expected = [step for step in range(100) if step >= 100 * TEXTURE_FROM and step % TEXTURE_EVERY == 0]
     for schedule in (whole, part):
         assert [step for step in range(100) if schedule.sees_texture(step)] == expected
