@@ -209,11 +209,9 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     for kind, names in ((SPOT, SPOT_NAME), (INFRARED, INFRARED_NAME)):
         left_out[kind] = _by_name(names, headers, root)
         headers = {path: headers[path] for path in _without([*headers], left_out[kind])}
-    beside = _masks_beside(headers)
-    left_out[MASKS] = [*left_out[MASKS], *beside]
-    images, deep, left_out[GREY] = _by_channels(
-        {path: headers[path] for path in _without([*headers], beside)}
-    )
+    masks = _masks_by_stem(headers)
+    left_out[MASKS] = [*left_out[MASKS], *masks]
+    images, deep, left_out[GREY] = _by_channels({path: headers[path] for path in _without([*headers], masks)})
     left_out[DEEP_TIFF] = [path for path in deep if path.suffix.lower() in (".tif", ".tiff")]
     left_out[DEPTH] = _without(deep, left_out[DEEP_TIFF])
     left_out[BANDS] = _other_bands([path for path in images if _is_grey(headers[path])])
@@ -292,7 +290,7 @@ def _masks(images: Sequence[Path], root: Path) -> list[Path]:
     return masks if len(masks) < len(images) else []
 
 
-def _masks_beside(headers: Mapping[Path, Header | None]) -> list[Path]:
+def _masks_by_stem(headers: Mapping[Path, Header | None]) -> list[Path]:
     """Return the PNG files that are masks of a photograph of the same stem and size in their folder.
 
     The first one of each folder decides.
