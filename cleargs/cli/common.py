@@ -21,7 +21,7 @@ from cleargs.pipeline.session import usable_cores
 from cleargs.pipeline.settings import settings_of
 from cleargs.pipeline.stages import installed
 from cleargs.progress import Say
-from cleargs.splat.config import Quality
+from cleargs.splat.config import STEPS_FACTOR, Quality
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -221,8 +221,8 @@ quality_option = click.option(
     "--quality",
     type=click.Choice(get_args(Quality)),
     help="The cost of a run: draft is a preview of at most 60 frames of 640 px, without repairs; standard "
-    "is for publishing; high takes four times its steps and twice its Gaussians. Steps and budgets in the "
-    "recipe are kept.  [default: that of the run; standard for a new run]",
+    f"is for publishing; high takes {STEPS_FACTOR['high']:.0f} times its steps and twice its Gaussians. "
+    "Steps and budgets in the recipe are kept.  [default: that of the run; standard for a new run]",
 )
 
 

@@ -29,6 +29,7 @@ from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
 from cleargs.report.outcome import short_training
 from cleargs.rivr.summaries import G0Summary
+from cleargs.splat.config import STEPS_FACTOR
 
 FEW_PLACED = 0.8
 """Share of frames with a pose below which the report gives advice on the other frames."""
@@ -205,7 +206,7 @@ def _on_training(
     elif g0.quality == "standard" and not named:
         yield Advice(
             "The training can be longer",
-            "High quality takes four times the steps and twice the Gaussians.",
+            f"High quality takes {STEPS_FACTOR['high']:.0f} times the steps and twice the Gaussians.",
             "+0.4 to 0.9 dB at new views on three captures, none on a fourth, -1.1 dB on a blurred one",
             0.6,
             ("--quality", "high"),
