@@ -101,7 +101,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
         tolerance=TOLERANCE if looks else 0.0,
         measured=load_paths(ingest),
     )
-    trained, dropped, few, fits = train_into(
+    trained, dropped, drawn_in, few, fits = train_into(
         context.out,
         Scene(gaussians, config.antialias, config.background or BLACK),
         views,
@@ -122,6 +122,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
             gaussians_start=gaussians.num,
             gaussians=trained.scene.gaussians.num,
             gaussians_dropped=dropped,
+            gaussians_drawn_in=drawn_in,
             steps=config.length,
             sh_degree=gaussians.sh_degree,
             exposure=exposure is not None,

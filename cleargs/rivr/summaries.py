@@ -24,6 +24,7 @@ class G0Summary(TrainingSummary):
     gaussians_start: int | None = None
     gaussians: int | None = None
     gaussians_dropped: int | None = None
+    gaussians_drawn_in: int | None = None
     steps: int | None = None
     sh_degree: int | None = None
     exposure: bool | None = None

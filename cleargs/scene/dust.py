@@ -1,4 +1,7 @@
-"""Dust: Gaussians far outside that no training view shows. They make the box of a scene too large."""
+"""Gaussians far outside, which make the box of a scene too large. Viewers frame a scene by its box.
+
+Those that no training view shows are dust, and are removed. Those that a view shows are drawn in.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,8 +33,10 @@ REDUCTION = 0.5
 MIDDLE, OUTSIDE = 0.98, 1.5
 """Dust is outside the box of this middle share of the means along each axis, enlarged by this factor. Inside,
 small contributions add up: without them LPIPS rose by 7 % (docs/experiments/training.md)."""
+FAR = 5.0
+"""Gaussians outside the box of the middle share, enlarged by this factor, are drawn in to its faces."""
 MAX_LOSS = 0.02
-"""Loss of PSNR on the training views, dB, above which the dust stays."""
+"""Loss of PSNR on the training views, dB, above which the dust stays, or nothing is drawn in."""
 
 
 class Dusted(NamedTuple):
@@ -39,6 +45,8 @@ class Dusted(NamedTuple):
     trained: Trained
     dropped: int
     """Number of Gaussians that were dust."""
+    drawn_in: int
+    """Number of Gaussians that were drawn in."""
     compared: list[TrainingView]
     fits: list[ViewPsnr]
 
@@ -51,38 +59,83 @@ def without_dust(
     moving: Mapping[int, MaskBool],
     device: str,
 ) -> Dusted:
-    """Remove the `DUST` of a training, and its moments of Adam, if the frames lose at most `MAX_LOSS`."""
+    """Remove the `DUST` of a training, with its moments of Adam, and draw in what is `FAR` outside.
+
+    Each of both happens only if the frames lose at most `MAX_LOSS`.
+    """
     real = [view for view in views if view.kind == "real"]
     few, scene = spread(real, MAX_EVALUATED), trained.scene.to(device)
-    seen = ~outside(scene.gaussians.means)
+
+    def fits_of(changed: Scene) -> list[ViewPsnr]:
+        return evaluate_views(changed, few, exposure, formations, moving=moving)
+
+    fits = fits_of(scene)
+    seen = ~outside(scene.gaussians.means, OUTSIDE)
     if not seen.all():
         largest = contributions(scene, (view.camera.scaled(REDUCTION) for view in real), lambda: None)
         seen |= largest >= DUST * REDUCTION**2
-    if seen.all():
-        return Dusted(trained, 0, few, evaluate_views(scene, few, exposure, formations, moving=moving))
-    smaller = replace(scene, gaussians=scene.gaussians.select(seen))
-    before, after = (
-        evaluate_views(one, few, exposure, formations, moving=moving) for one in (scene, smaller)
-    )
-    psnr = [mean_psnr(fit.psnr for fit in fits) or 0.0 for fits in (before, after)]
-    if psnr[1] < psnr[0] - MAX_LOSS:
-        return Dusted(trained, 0, few, before)
-    kept = seen.cpu()
-    state = {
-        name: tensor[kept] if name.startswith(("first.", "second.", "strategy.")) else tensor
-        for name, tensor in trained.state.items()
-    }
-    smallest = replace(trained, scene=smaller.to("cpu"), state=state)
-    return Dusted(smallest, int((~seen).sum()), few, after)
+    if not seen.all():
+        smaller = replace(scene, gaussians=scene.gaussians.select(seen))
+        if _as_good(found := fits_of(smaller), fits):
+            scene, fits = smaller, found
+        else:
+            seen[:] = True
+    far = outside(scene.gaussians.means, FAR)
+    if far.any():
+        centre = np.mean([view.camera.centre for view in real], axis=0)
+        nearer = replace(
+            scene, gaussians=drawn_in(scene.gaussians, torch.tensor(centre, dtype=torch.float32))
+        )
+        if _as_good(found := fits_of(nearer), fits):
+            scene, fits = nearer, found
+        else:
+            far[:] = False
+    state = trained.state
+    if not seen.all():
+        kept = seen.cpu()
+        state = {
+            name: tensor[kept] if name.startswith(("first.", "second.", "strategy.")) else tensor
+            for name, tensor in state.items()
+        }
+    done = replace(trained, scene=scene.to("cpu"), state=state)
+    return Dusted(done, int((~seen).sum()), int(far.sum()), few, fits)
 
 
-def outside(means: Tensor) -> Tensor:  # [N, 3] -> [N]
-    """Return True for means outside the enlarged box of the middle of the scene."""
+def _as_good(fits: Sequence[ViewPsnr], before: Sequence[ViewPsnr]) -> bool:
+    """Return True if views lose at most `MAX_LOSS`."""
+    psnr = [mean_psnr(fit.psnr for fit in each) or 0.0 for each in (before, fits)]
+    return psnr[1] >= psnr[0] - MAX_LOSS
+
+
+def middle_box(means: Tensor) -> tuple[Tensor, Tensor]:  # [N, 3] -> [3] each
+    """Return the centre and half the sides of the box of the `MIDDLE` of the means along each axis."""
     order = means.sort(dim=0).values
     cut = round(0.5 * (1.0 - MIDDLE) * (len(means) - 1))
     low, high = order[cut], order[-1 - cut]
-    reach = OUTSIDE * 0.5 * (high - low)
-    return ((means - 0.5 * (low + high)).abs() > reach).any(dim=1)
+    return 0.5 * (low + high), 0.5 * (high - low)
+
+
+def outside(means: Tensor, factor: float) -> Tensor:  # [N, 3] -> [N]
+    """Return True for means outside the `middle_box`, enlarged by a factor."""
+    middle, reach = middle_box(means)
+    return ((means - middle).abs() > factor * reach).any(dim=1)
+
+
+def drawn_in(gaussians: Gaussians, centre: Tensor) -> Gaussians:
+    """Return the Gaussians with those that are `FAR` outside moved to the faces of that box.
+
+    They move on the lines to ``centre`` [3], the mean of the cameras, and shrink in proportion, so they look
+    almost the same from the cameras. A centre outside the box is moved into it.
+    """
+    middle, reach = middle_box(gaussians.means)
+    centre = torch.maximum(torch.minimum(centre.to(middle.device), middle + reach), middle - reach)
+    start, way = centre - middle, gaussians.means - centre
+    # The share of each way at which it meets a face: the smallest over the three axes.
+    share = (FAR * reach - torch.sign(way) * start) / way.abs().clamp(min=1e-30)
+    share = share.amin(dim=1, keepdim=True).clamp(1e-3, 1.0)
+    far = share < 1.0
+    means = torch.where(far, centre + share * way, gaussians.means)
+    return replace(gaussians, means=means, log_scales=gaussians.log_scales + torch.log(share))
 
 
 def contributions(scene: Scene, cameras: Iterable[Camera], advance: Callable[[], None]) -> Tensor:  # [N]

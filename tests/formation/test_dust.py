@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pyarrow as pa
+import pytest
 import torch
 from helpers import splat_toy
 
-from cleargs.scene.dust import MAX_LOSS, without_dust
+from cleargs.scene.dust import FAR, MAX_LOSS, drawn_in, middle_box, without_dust
 from cleargs.splat.backend import mean_psnr
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
@@ -72,3 +75,38 @@ def test_unseen_gaussians_inside_the_scene_stay() -> None:
     pictures = splat_toy.views(splat_toy.images(truth, 4))
     done = without_dust(trained(together(small, truth)), pictures, None, {}, {}, "cpu")
     assert done.dropped == 0 and done.trained.scene.gaussians.num == truth.num + 5
+
+
+def test_what_is_far_outside_moves_on_the_line_to_the_cameras_and_shrinks() -> None:
+    truth = splat_toy.gaussians()
+    far = replace(truth.select(torch.arange(2)), means=torch.tensor([[0.0, 90.0, 3.0], [-20.0, 1.0, -30.0]]))
+    both, eye = together(far, truth), torch.tensor([0.3, 0.1, -0.2])
+    nearer = drawn_in(both, eye)
+    middle, reach = middle_box(both.means)
+    assert torch.allclose(((nearer.means[:2] - middle).abs() / reach).amax(dim=1), torch.tensor(FAR))
+    before, after = both.means[:2] - eye, nearer.means[:2] - eye
+    share = torch.linalg.vector_norm(after, dim=1) / torch.linalg.vector_norm(before, dim=1)
+    assert torch.allclose(after, share[:, None] * before, atol=1e-5)
+    change = nearer.log_scales[:2] - both.log_scales[:2]
+    assert torch.allclose(change, share.log()[:, None].expand(-1, 3), atol=1e-5)
+    assert torch.equal(nearer.means[2:], truth.means) and torch.equal(nearer.log_scales[2:], truth.log_scales)
+
+
+@pytest.mark.parametrize("cameras", [1, 4])
+def test_it_is_drawn_in_if_the_frames_lose_nothing(cameras: int) -> None:
+    """A large Gaussian far behind the scene. One camera sees no change, four see parallax."""
+    truth = splat_toy.gaussians()
+    far = replace(
+        truth.select(torch.arange(1)),
+        means=torch.tensor([[1.0, 0.0, 40.0]]),
+        log_scales=torch.full((1, 3), math.log(6.0)),
+    )
+    both, rng = together(truth, far), np.random.default_rng(0)
+    noisy = [
+        np.clip(image + rng.normal(0, 8, image.shape), 0, 255).astype(np.uint8)
+        for image in splat_toy.images(both, cameras)
+    ]
+    done = without_dust(trained(both), splat_toy.views(noisy), None, {}, {}, "cpu")
+    last = float(done.trained.scene.gaussians.means[-1, 2])
+    assert done.dropped == 0 and done.drawn_in == (cameras == 1)
+    assert last < 3.0 if cameras == 1 else last == 40.0
