@@ -17,8 +17,9 @@ from cleargs.safe_io import read_json
 def write_native(room: Path, out: Path, *, chosen: bool) -> None:
     """Write the frames of ``room``, made by `cleargs synth --video`, as numbered images with true poses.
 
-    The frames of the capture are its images. Those between them, and two at each end, are from its video.
-    With ``chosen``, only the frames of the capture are written. The reference views are those of the room.
+    The frames of the capture are its images, those between them are from its video. An ingest that takes as
+    many frames as the capture has takes its frames. With ``chosen``, only these are written. The reference
+    views are those of the room.
 
     Raises InputError if the room has no video of all frames.
     """
@@ -33,7 +34,7 @@ def write_native(room: Path, out: Path, *, chosen: bool) -> None:
         link_or_copy(images[number], _made(out / name))
     if not chosen:
         pts = read_timeline(room / "capture.mp4").pts
-        between = range(max(0, min(images) - 2), min(len(pts), max(images) + 3))
+        between = range(min(images), max(images) + 1)
         numbers = {pts[number]: number for number in between if number not in images}
         for stamp, frame in decode_frames(room / "capture.mp4", list(numbers)):
             names[numbers[stamp]] = f"images/{numbers[stamp]:06d}.png"

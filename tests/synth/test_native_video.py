@@ -11,6 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.linalg import expm
 
+from benchmarks.native import write_native
+from cleargs.capture.folders import spread
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
 from cleargs.media.image import read_rgb
@@ -99,6 +101,16 @@ def test_every_fifth_frame_of_the_video_is_in_the_capture(captures: dict[str, Pa
         assert here > max(psnr(shown[row["video_frame"] + step], image) for step in (-1, 1)) + 1.5
         if name != "phone":  # colours do not shift
             assert np.abs((shown[row["video_frame"]] - image).mean((0, 1))).max() < 0.7
+
+
+def test_a_room_with_all_frames_gives_the_frames_of_the_capture(
+    captures: dict[str, Path], tmp_path: Path
+) -> None:
+    """An ingest of as many frames takes those whose sharp truth the room has."""
+    write_native(captures["sharp"], tmp_path, chosen=False)
+    names = sorted(path.name for path in (tmp_path / "images").iterdir())
+    assert len(names) == STRIDE * (FRAMES - 1) + 1
+    assert spread(names, FRAMES) == [f"{number:06d}.png" for number in (2, 7, 12, 17, 22)]
 
 
 def test_a_video_changes_no_other_file(captures: dict[str, Path], tmp_path: Path) -> None:
