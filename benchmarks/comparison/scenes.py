@@ -32,10 +32,11 @@ from cleargs.pipeline.stages import Stages
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.safe_io import read_bytes, read_json
+from cleargs.scene.folder import SceneFolder
 from cleargs.splat.ply import read_ply
 from cleargs.types import Device
 
-EVALUATION_VERSION = 3
+EVALUATION_VERSION = 4
 """Version of the cache. Increase it when an evaluation of equal inputs gives other figures."""
 
 
@@ -232,7 +233,7 @@ def evaluate_views(
                 sample=finished.sample.name,
                 variant=finished.variant.name,
                 views=view_set.views,
-                means=evaluation.means,
+                means=compared_means(finished.scene, evaluation),
                 images=len(evaluation.images),
                 trained_on=_trained_on(finished, view_set),
                 seconds=finished.seconds,
@@ -248,6 +249,16 @@ def evaluate_views(
             )
         )
     return cells
+
+
+def compared_means(scene: Path, evaluation: Evaluation) -> dict[str, float | None]:
+    """Return metric -> mean of an evaluation: as the cameras took the frames, if this is known and fair.
+
+    A scene that was trained with image formation does not have the motion that held-out frames have. A scene
+    that was trained without it has learned that motion, and is compared without it.
+    """
+    trained_with_it = SceneFolder(scene.parent).formation_rows()
+    return evaluation.means | (evaluation.formed if trained_with_it else {})
 
 
 def _trained_on(finished: FinishedScene, view_set: ReferenceSet) -> int | None:

@@ -75,14 +75,25 @@ def renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None, exposure_
         return rendered.depth.numpy(), rendered.alpha.numpy()
 
     def predict(view: ReferenceView, target: ImageU8, mask: MaskBool | None) -> Prediction:
-        camera, refinement, far = view.camera, None, None
+        def plain(camera: Camera) -> ArrayF64:
+            return render(camera)[int(view.cut_out)]
+
+        def as_filmed(camera: Camera) -> ArrayF64:
+            assert view.path is not None
+            formed = FormedView(camera, 1.0, formation=filmed_as(view.path.exposed(exposure_s, camera)))
+            seen = formed.forward(engine.view(scene, formed.camera, depth=True))
+            return seen.clamp(0.0, 1.0).numpy().astype(np.float64)
+
+        camera = filmed_by = view.camera
+        refinement, far = None, None
+        moves = view.path is not None and (view.path.rolls or exposure_s > 0.0)
         if refine_steps:
             depth, alpha = depth_and_alpha(camera)
             shown = alpha > 0.5
             distance = float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
-            camera, refinement = refine_pose(
-                lambda camera: render(camera)[int(view.cut_out)], camera, distance, target, mask, refine_steps
-            )
+            if moves:  # the pose that fits a render without the motion makes up for a part of it
+                filmed_by, _ = refine_pose(as_filmed, camera, distance, target, mask, refine_steps)
+            camera, refinement = refine_pose(plain, camera, distance, target, mask, refine_steps)
         farthest = None if points is None else metrics.depth_of_points(points, camera)
         if farthest is not None:
             far = metrics.far_pixels(*depth_and_alpha(camera), farthest)
@@ -96,11 +107,7 @@ def renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None, exposure_
                     hint="delete the depth, or write it at the size of the images",
                 )
             covered = covered_share(scene, camera, surface / view.unit, mask)
-        filmed = None
-        if view.path is not None and (view.path.rolls or exposure_s > 0.0):
-            formed = FormedView(camera, 1.0, formation=filmed_as(view.path.exposed(exposure_s, camera)))
-            seen = formed.forward(engine.view(scene, formed.camera, depth=True))
-            filmed = seen.clamp(0.0, 1.0).numpy().astype(np.float64)
+        filmed = as_filmed(filmed_by) if moves else None
         return Prediction(*render(camera), refinement, far, covered, filmed)
 
     return predict

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from benchmarks.commands import invoke
@@ -23,14 +25,16 @@ from benchmarks.comparison.real import (
     summary_table,
     with_tables,
 )
-from benchmarks.comparison.scenes import SceneRecipe
+from benchmarks.comparison.scenes import SceneRecipe, compared_means
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
+from cleargs.evaluate.eval_report import Evaluation
 from cleargs.media.image import read_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.stages import installed
 from cleargs.progress import SilentReporter
+from cleargs.scene.folder import FORMATION
 from cleargs.synth.synthetic_capture import make_capture
 
 SETTINGS = ("g0.min_points=400", "g0.budget=500", "ingest.max_features=512", "ingest.holdout=every:3")
@@ -59,6 +63,13 @@ def cell(variant: str, seed: int, psnr: float) -> Cell:
         peak_memory_gb=1,
         evaluation=f"evaluations/{variant}-{seed}",
     )
+
+
+def test_a_scene_with_image_formation_is_compared_as_its_frames_were_filmed(tmp_path: Path) -> None:
+    found = Evaluation.model_construct(means={"psnr": 29.0, "covered": 0.1}, formed={"psnr": 32.0})
+    assert compared_means(tmp_path / "scene.ply", found) == {"psnr": 29.0, "covered": 0.1}
+    pq.write_table(pa.table({"frame_id": [0]}), tmp_path / FORMATION)
+    assert compared_means(tmp_path / "scene.ply", found) == {"psnr": 32.0, "covered": 0.1}
 
 
 def test_the_list_has_valid_settings_and_names_its_sources() -> None:
