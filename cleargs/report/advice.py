@@ -142,10 +142,11 @@ def _on_frames(
     config: Config, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
 ) -> Iterator[Advice]:
     ingest: Any = config.sections["ingest"]
+    g0: Any = config.sections["g0"]
     unplaced = sum(row.role == UNPLACED for row in rows)
     available = IngestSummary.of(manifests.get("ingest")).frames_available or 0
     more: dict[str, Any] = {}  # the setting that limits the number of frames, if the capture has more
-    if available > len(rows):
+    if available > len(rows) and g0.quality != "draft":
         if ingest.fps is not None and len(rows) < ingest.max_frames:
             more = {"ingest.fps": 2 * ingest.fps}
         else:
@@ -160,7 +161,7 @@ def _on_frames(
             5.0,
             tuple(_set(more | overlap)),
         )
-    elif available > 1.5 * len(rows):
+    elif more and available > 1.5 * len(rows):
         yield Advice(
             f"{len(rows)} of {available} frames were used",
             "More frames show each surface from more views.",

@@ -72,7 +72,7 @@ def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], unseen: S
     if any(row.weight is not None for row in rows):
         used = [row for row in rows if row.weight]
         simulated = sum(row.modelled for row in used)
-        parts.append(f"{len(used)} used in training, {simulated} with simulated blur or defocus")
+        parts.append(f"{len(used)} used in training, {simulated} with simulated blur, skew or defocus")
     repaired = ConsolidateSummary.of(manifests.get("consolidate")).repairs
     if repaired is not None:
         parts.append(f"{repaired} repaired")

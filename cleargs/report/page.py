@@ -64,7 +64,10 @@ def write_report(planner: Planner, edited: Path | None = None) -> Path:
     for manifest in manifests.values():
         versions |= {**manifest.versions, **manifest.parts.libraries}
     changed = edited_scene(run, trained[-1], edited) if edited and trained else None
-    with whole_folder(page_of(run).parent, replace=True) as folder:
+    with (
+        planner.reporter.task("writing the report"),
+        whole_folder(page_of(run).parent, replace=True) as folder,
+    ):
         scene, final, viewer = None, None, ""
         if trained and placed:
             scene, final = _write_scene(folder, run, trained[-1], placed, changed)

@@ -74,7 +74,7 @@ def training_curves(run: Path, stages: Sequence[str]) -> dict[str, Any] | None:
     one view, and views differ more than steps. Raises StoreError if a table cannot be read.
     """
     logs = {stage: SceneFolder(run / stage).log() for stage in stages}
-    tables = {stage: log for stage, log in logs.items() if log is not None}
+    tables = {stage: log for stage, log in logs.items() if log is not None and log.num_rows}
     steps = pa.concat_tables([TRAIN.empty_table(), *tables.values()])
     real = np.array(steps["kind"].to_pylist()) == "real"
     if not real.any():

@@ -61,6 +61,14 @@ def test_advice_is_only_what_can_help(tmp_path: Path) -> None:
     assert first(150, 400) == "--set ingest.max_frames=300 --set ingest.overlap=16"
 
 
+def test_a_draft_gets_no_advice_that_it_does_not_follow(tmp_path: Path) -> None:
+    """A draft takes 60 frames, whatever the setting is: a command for more of them did nothing."""
+    found = advice(tmp_path, [frame() for _ in range(60)], ingest(120), "g0.quality=draft")
+    assert not any("ingest.max_frames" in shown.command for shown in found)
+    found = advice(tmp_path, [frame("lost")] * 60, ingest(120), "g0.quality=draft")
+    assert not any("ingest.max_frames" in shown.command for shown in found)
+
+
 def test_holding_out_frames_is_never_the_only_command(tmp_path: Path) -> None:
     rows = [frame() for _ in range(40)]
     assert advice(tmp_path, rows, ingest(40)) == [], "nothing is wrong"

@@ -26,18 +26,21 @@ from cleargs.errors import InputError
 from cleargs.formation.movement import write_movement
 from cleargs.manifest import Manifest, linked_manifest, write_manifest
 from cleargs.media.image import write_mask
+from cleargs.parquet import write_table
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
+from cleargs.progress import reporter_of
 from cleargs.report.advice import command
 from cleargs.report.frames import FrameRow, load_rows
 from cleargs.report.html import json_in_html
 from cleargs.report.page import write_report
-from cleargs.report.page_data import changed_settings, frame_data
+from cleargs.report.page_data import changed_settings, frame_data, training_curves
 from cleargs.report.pictures import FramePictures, ImageFile, layers_of
 from cleargs.report.report_json import cameras_of, is_current, linked_manifests
 from cleargs.report.single_file import single_file_size, write_single_file
 from cleargs.report.web_scene import SCENE_BYTES, shown_degree, write_scene
 from cleargs.rivr.tables import Selection
+from cleargs.splat.tables import TRAIN
 
 
 def test_a_frame_that_was_not_tried_says_why() -> None:
@@ -229,6 +232,24 @@ def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
     with DigestMemo(tmp_path / "digests.json") as memo:
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
     assert "0 repaired." in text
+
+
+def test_the_curves_name_only_the_stages_that_trained(tmp_path: Path) -> None:
+    """A draft trains once. Its report named all three trainings, one over the other."""
+    run = FinishedRun(tmp_path)
+    write_table(run.folder / "consolidate/train.parquet", TRAIN.empty_table(), TRAIN)
+    found = training_curves(run.folder, ("g0", "consolidate"))
+    assert found is not None and found["parts"] == [("g0", 0)]
+
+
+def test_writing_a_report_is_announced(tmp_path: Path) -> None:
+    """It takes seconds, on a busy machine more than ten of them."""
+    run, lines = FinishedRun(tmp_path), list[str]()
+    with DigestMemo(tmp_path / "digests.json") as memo:
+        planner = run.planner(Store(tmp_path, memo))
+        planner.reporter = reporter_of(lines.append)
+        write_report(planner)
+    assert "writing the report: started" in lines
 
 
 def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
