@@ -262,15 +262,9 @@ def make_renders() -> None:
         write_rgb(Path("mine") / f"{path.stem}.png", read_rgb(path) // 2 + 64)
 
 
-def export_cameras() -> None:
-    assert invoke(["export", "walk", "-o", "own.ply", "--cameras"]) == 0
-    shutil.copy("own.cameras.json", "cameras.json")
-
-
 PREPARE: dict[str, Callable[[], None]] = {
     "--scene RUN/g0/scene.ply": make_measured_run,
     "--renders mine": make_renders,
-    "--poses cameras.json": export_cameras,
 }
 """Part of a command -> what its page takes as given, made before it runs."""
 

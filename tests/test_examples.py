@@ -245,6 +245,16 @@ def test_frames_can_be_deblurred_for_other_trainers(
     assert "--capture" in capsys.readouterr().err
 
 
+def test_options_of_a_scene_are_refused_for_a_capture(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They had no effect, without a word. A folder that exists was called a fault of the disk."""
+    words = ["export", str(place / "run"), "--capture", str(tmp_path / "data"), "--metres", "0-1=2", "--up=y"]
+    assert invoke(words) == 2 and "leave out --up, --metres" in capsys.readouterr().err
+    (tmp_path / "data").mkdir()
+    assert invoke(words[:4]) == 2 and "data exists already" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("held", ["10000000" * 4, "0100100", "0111000000", "1010101011", "000"])
 def test_every_nth_image_is_one_that_was_held_out(held: str, place: Path) -> None:
     some = cg.open_prepared(cg.open_run(place / "run")["ingest"]).frames[0]

@@ -154,8 +154,8 @@ edited_option = click.option(
     "--scene",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Use this edited copy in place of the scene of RUN. To make one, export without --up, --world and "
-    "--metres, and delete or change Gaussians in an editor.",
+    help="Use this edited copy in place of the scene of RUN. To make one, export without --up, "
+    "--upright, --world and --metres, and delete or change Gaussians in an editor.",
 )
 until_option = click.option(
     "--until", metavar="STAGE", shell_complete=complete_stage, help="The last stage to run."

@@ -7,6 +7,7 @@ from shlex import quote
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from cleargs.cli.common import (
     FILE,
@@ -20,8 +21,12 @@ from cleargs.cli.common import (
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.stages import Stages, installed
+from cleargs.progress import Reporter
 from cleargs.render import TARGETS
 from cleargs.run_results import scene_stage
+
+_OF_CAPTURE = frozenset({"run", "capture", "repeat", "deblurred", "as_json", "quiet", "log", "progress"})
+"""Parameters of `export` that ``--capture`` may have next to it."""
 
 
 @click.command(
@@ -169,9 +174,16 @@ def export(
     from cleargs.render.export import ExportOptions, export_file, export_scene
 
     if capture is not None:
-        if outputs or program:
-            raise InputError("--capture writes no scene", hint="give it without -o and --for")
-        _export_capture(run, capture, repeat, deblurred, as_json)
+        context = click.get_current_context()
+        wrong = [
+            one.opts[-1]
+            for one in context.command.params
+            if one.name not in _OF_CAPTURE
+            and context.get_parameter_source(one.name or "") is ParameterSource.COMMANDLINE
+        ]
+        if wrong:
+            raise InputError("--capture writes no scene", hint=f"leave out {', '.join(wrong)}")
+        _export_capture(run, capture, repeat, deblurred, make_reporter(quiet), as_json)
         return
     if repeat > 1 or deblurred:
         raise InputError("--repeat and --deblurred are for --capture FOLDER", hint="leave them out")
@@ -194,7 +206,9 @@ def export(
     answer(as_json, {"files": list(map(str, outputs)), "stage": stage, "messages": lines}, *lines)
 
 
-def _export_capture(run: Path, folder: Path, repeat: int, deblurred: bool, as_json: bool) -> None:
+def _export_capture(
+    run: Path, folder: Path, repeat: int, deblurred: bool, reporter: Reporter, as_json: bool
+) -> None:
     """Write the frames of ``run`` for other trainers."""
     from cleargs.handover import SPLIT
     from cleargs.run_results import open_prepared, open_run
@@ -211,7 +225,10 @@ def _export_capture(run: Path, folder: Path, repeat: int, deblurred: bool, as_js
         trained = SceneViewer(run / scene_stage(installed(), run, None))
         views = {frame.frame_id: view_of(frame, prepared.folder, 1.0) for frame in prepared.frames}
         sharper = lambda number: trained.deblur(views[number])  # noqa: E731
-    made = prepared.to_nerfstudio(folder, weights, repeat=repeat, sharper=sharper)
+    if folder.exists():
+        raise InputError(f"{folder} exists already", hint="choose a new folder")
+    with reporter.task("writing the capture"):
+        made = prepared.to_nerfstudio(folder, weights, repeat=repeat, sharper=sharper)
     split = read_json(made / SPLIT)
     lines = [f"written: {made} ({len(split['train'])} frames for training, {len(split['test'])} held out)"]
     lines.append(f"nerfstudio: ns-train splatfacto --data {quote(str(made))}")

@@ -127,7 +127,7 @@ def render(
     camera = shots[0].camera
     width = camera.width * (2 if given.side_by_side else 1)
     facts = {"file": str(output), "stage": stage, "pictures": len(shots)}
-    origin = stage if run.is_file() else scene_origin(dag, run, stage)
+    origin = str(given.scene or (stage if run.is_file() else scene_origin(dag, run, stage)))
     answer(
         as_json,
         {**facts, "width": width, "height": camera.height},

@@ -94,7 +94,7 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], settings: Mapping[str, Any])
 
     frame, rated = row.frame, facts["rva"]
     if row.weight_text:
-        yield "counts", row.weight_text
+        yield "training", row.weight_text
     yield "file", frame.name
     if frame.time_s is not None:
         yield "time", f"{frame.time_s:.2f} s"

@@ -102,7 +102,8 @@ def export_scene(
         check_outputs([file], installed(), run, force=options.force)
         write_json(file, views_json(views, next(iter(cameras.values()))[1], **similarity))
         messages.append(f"{file}: {len(views)} views")
-    axes = f"{options.up} is up" if options.up is not None else f"{options.world} world"
+    up = options.up or ("-y" if options.upright is not None else None)
+    axes = f"{options.world} world" if up is None else f"{up} is up"
     if options.metres is not None:
         axes += f", in metres (a unit of the run is {similarity['scale']:.4g} m)"
     eyes = np.stack([camera.centre for _, camera in cameras.values()])

@@ -73,10 +73,9 @@ def drop_spheres(scene: Scene, spheres: Iterable[tuple[float, ...]]) -> tuple[Sc
     messages = []
     for *centre, radius in spheres:
         away = torch.linalg.vector_norm(scene.gaussians.means - torch.tensor(centre), dim=1) > radius
-        if away.all():
-            raise InputError(
-                f"no Gaussian is in the sphere {_numbers((*centre, radius))}", hint=extent_text(scene)
-            )
+        if away.all() or not away.any():
+            what = "no Gaussian is" if away.all() else "all Gaussians are"
+            raise InputError(f"{what} in the sphere {_numbers((*centre, radius))}", hint=extent_text(scene))
         messages.append(f"dropped {int((~away).sum())} Gaussians in the sphere {_numbers((*centre, radius))}")
         scene = replace(scene, gaussians=scene.gaussians.select(away))
     return scene, messages

@@ -11,8 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
+from cleargs.capture.summary import IngestSummary
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
+from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.media.encode import Codec
 from cleargs.packed import require_images
@@ -122,6 +124,10 @@ def render_run(
         if options.side_by_side:
             require_images(run, "--side-by-side")
         shots, file = _shots(run / "ingest", options, kind), scene_path(run, stage)
+        if options.poses is not None and not _has_given_world(run) and _world_of(options) == "input":
+            reporter.warn(
+                f"poses of another program do not fit: ClearGS found those of {run} itself, in its own world"
+            )
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
         scene = read_scene(file) if options.scene is None else edited_scene(run, stage, options.scene)
         write_shots(output, scene, shots, task, fps=options.fps, codec=options.codec, device=device)
@@ -163,6 +169,19 @@ def _shots(ingest: Path, options: ShotOptions, kind: Kind) -> list[Shot]:
         filmed = [frames[index] for index in nearest]
     images = [ingest / frame.image for frame in filmed] if options.side_by_side else None
     return _framed(cameras, options, kind, images)
+
+
+def _has_given_world(run: Path) -> bool:
+    """Return False if the poses of ``run`` were found without poses of the input."""
+    found = IngestSummary.of(linked_manifest(run, "ingest"))
+    return found.poses != "sfm" or bool(found.kept_out_matches_off_px)
+
+
+def _world_of(options: ShotOptions) -> World:
+    """Return the world of the poses: that of the options, or the usual one of their file."""
+    assert options.poses is not None
+    usual: World = "normalised" if isinstance(read_json(options.poses), list) else "input"
+    return options.world or usual
 
 
 def _framed(

@@ -61,7 +61,10 @@ class Densifier(Protocol):
         """Change the Gaussians after a step. New rows need moments."""
 
     def expected_counts(self, start: int) -> NDArray[np.float64]:
-        """Return the expected number of Gaussians in each step of the training, [length], from ``start``."""
+        """Return the expected number of Gaussians in each step of the training, [length], from ``start``.
+
+        The last one becomes the ``budget`` of G0, and G0 starts from a part of it (`planned_start`).
+        """
 
 
 class MCMC:

@@ -84,6 +84,8 @@ def _fraction_bits(gaussians: Gaussians) -> int:
     most = min(int(np.floor(23 - np.log2(max(reach, 1e-9)) - 1e-9)), _FRACTION_BITS_MAX)
     # A disc that gets thicker looks nearly the same, so only its second axis must not be too short.
     small, large = (float(_outside(sizes[:, axis]).float().mean()) for axis in (1, 2))
+    if np.exp(_LOG_SCALES[0]) < _COARSE * thin:
+        small = 0.0  # specks that are enlarged to the least size are still far smaller than the others
     if small > _SMALL or large > _LARGE or 2.0**-most > _COARSE * thin:
         raise InputError(
             ".spz cannot hold the scene: it stores lengths from 0.000045 to 380 units, and positions in "

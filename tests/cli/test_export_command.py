@@ -20,7 +20,7 @@ from eval_world import cameras, make_scene, write_run
 
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
-from cleargs.render.pruning import crop_scene
+from cleargs.render.pruning import crop_scene, drop_spheres
 from cleargs.splat.formats import padded, read_scene
 from cleargs.splat.ply import read_ply
 
@@ -75,6 +75,19 @@ def test_a_scene_is_named_after_the_stage_that_made_it(
     assert f"scene of {made_by}, " in capsys.readouterr().out
     assert invoke(["show", str(run), "scene"]) == 0
     assert f"scene of {made_by}: 20 Gaussians" in capsys.readouterr().out
+
+
+def test_a_sphere_around_everything_names_the_extent() -> None:
+    with pytest.raises(InputError, match="all Gaussians are in the sphere 0,0,0,1e") as caught:
+        drop_spheres(make_scene(count=5), [(0.0, 0.0, 0.0, 1e6)])
+    assert "the scene is in box:" in caught.value.hint
+
+
+def test_a_scene_that_was_turned_says_so(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(run, tmp_path / "x.ply", "--upright", "1,0,0") == 0
+    assert "-y is up" in (said := capsys.readouterr().out) and "normalised world" not in said
 
 
 def test_nothing_left_to_crop_is_an_error() -> None:

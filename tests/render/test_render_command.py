@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,24 @@ def test_poses_that_were_written_give_the_same_images(run: Path, tmp_path: Path)
         for index, view in enumerate(views):
             made = read_rgb(tmp_path / f"out{number}" / f"{index}.png").astype(int)
             assert np.abs(made - picture(make_scene(), view)).max() <= 2  # rounding
+
+
+def test_poses_of_another_world_get_a_warning(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without poses in the input, the world of a run fits no other file: the pictures were black."""
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}]})
+    )
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras_json([("0", cameras()[0])])))
+    for poses, errors in (("sfm", None), ("sfm", {"given": 1.0}), ("given", None)):
+        warned = poses == "sfm" and errors is None
+        found = SimpleNamespace(summary={"poses": poses, "kept_out_matches_off_px": errors})
+        monkeypatch.setattr("cleargs.render.shots.linked_manifest", lambda run, stage, found=found: found)
+        for file in ("transforms.json", "cameras.json"):
+            words = ("--poses", str(tmp_path / file), "--force")
+            assert render(run, tmp_path / "a.png", *words) == 0
+            assert ("do not fit" in capsys.readouterr().err) is (warned and file == "transforms.json")
 
 
 def test_the_lens_of_a_file_replaces_that_of_the_capture(tmp_path: Path) -> None:

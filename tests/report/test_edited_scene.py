@@ -50,10 +50,13 @@ def test_an_edited_scene_is_exported_at_the_place_of_the_run(
     assert len(means) == left.gaussians.num and float(means[:, 0].max()) < 0.1
 
 
-def test_films_and_the_report_show_it(run: FinishedRun, left: Scene, tmp_path: Path) -> None:
+def test_films_and_the_report_show_it(
+    run: FinishedRun, left: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_scene(tmp_path / "edited.ply", left, "ply")
     scene = ["--scene", str(tmp_path / "edited.ply")]
     assert invoke(["render", str(run.folder), *scene, "--frame", "3", "-o", str(tmp_path / "a.png")]) == 0
+    assert "edited.ply" in capsys.readouterr().out, "it named the stage"
     image = read_rgb(tmp_path / "a.png").astype(float)
     half = image.shape[1] // 2
     assert image[:, : half - 5].mean() > 60 and image[:, half + 5 :].mean() < 20

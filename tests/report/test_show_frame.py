@@ -41,7 +41,7 @@ def test_a_frame_in_words_fits_100_columns(
     assert max(map(len, lines)) <= 100
     words = " ".join(text.split())
     assert (
-        words.startswith("frame 2 counts motion blur 3.2 px, simulated: counts 75 % file clip.mp4#2")
+        words.startswith("frame 2 training motion blur 3.2 px, simulated: counts 75 % file clip.mp4#2")
         and "time 0.07 s" in words
     )
     assert "pose camera at (-0.200, 0.060, " in words
