@@ -5,13 +5,15 @@ from __future__ import annotations
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
 import cleargs as cg
-from cleargs.errors import ConfigError, InputError, StoreError
+from cleargs.cli.main import explanation
+from cleargs.errors import ConfigError, InputError, StageError, StoreError
 from cleargs.models.expert import load_expert
 from cleargs.models.scorer import load_scorer
 from cleargs.pipeline.config import load_config
@@ -19,7 +21,7 @@ from cleargs.pipeline.keys import plugin_versions
 from cleargs.pipeline.stages import installed
 from cleargs.plugins import plugins
 from cleargs.progress import SilentReporter
-from cleargs.rivr.candidates import Materials, candidate
+from cleargs.rivr.candidates import Materials, candidate, made_image
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.formation import Formation
@@ -160,6 +162,24 @@ def test_candidate(parts: Path) -> None:
     with pytest.raises(ConfigError, match="candidates") as caught:
         load_config(installed(), "default", ['rivr.candidates=["fuse"]'])
     assert caught.value.hint == "did you mean fused?"
+
+
+def test_faults_of_a_plugin_name_it(parts: Path) -> None:
+    """Once: "unexpected ValueError: operands could not be broadcast", and a request to report it."""
+    image = np.zeros((4, 6, 3), np.float32)
+    for wrong in (image[1:], image * np.nan):
+        with pytest.raises(StageError, match="the expert mine made an image of"):
+            made_image(wrong, image, "the expert mine")
+    assert made_image(image, image, "the expert mine") is image
+    information = parts / "cleargs_parts.dist-info/entry_points.txt"
+    information.write_text(information.read_text().replace("candidate:MEAN", "candidate:make"))
+    with pytest.raises(InputError, match="mean is not a candidate"):
+        candidate("mean")
+    try:
+        load_expert("unsharp").restore(cast(Any, "no image"))
+    except Exception as error:
+        code, cause, remedy = explanation(error)
+    assert code == 1 and cause.startswith("the plugin of cleargs-parts 1.0 failed: ") and "repair" in remedy
 
 
 def test_densifier(parts: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from shlex import quote
+from typing import get_args
 
 import click
 
@@ -20,6 +21,7 @@ from cleargs.cli.commands import ALIASES, COMMANDS, SECTIONS, as_called
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import no_space
 from cleargs.pipeline.stages import Stages, installed
+from cleargs.plugins import ExtensionPoint, package_of, plugins
 from cleargs.safe_io import printable, require_utf8
 
 INTERRUPTED = 130
@@ -193,7 +195,21 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             if isinstance(error, ValueError) and (names := _variables(error)):
                 cause = f"the environment variable {' or '.join(names)} cannot be used: {_one_line(error)}"
                 return 2, cause, "correct or unset it"
+            if package := failed_plugin(error):
+                cause = f"the plugin of {package} failed: {type(error).__name__}: {_one_line(error)}"
+                return 1, cause, "repeat the command with --debug to see the traceback, and repair the plugin"
             return 1, cause, "repeat the command with --debug to see the traceback, and please report it"
+
+
+def failed_plugin(error: Exception) -> str | None:
+    """Return name and version of the package with plugins whose code raised ``error``; None if none did."""
+    packages = {
+        plugin.module.partition(".")[0]: " ".join(package_of(plugin))
+        for point in get_args(ExtensionPoint)
+        for plugin in plugins(point).values()
+    }
+    modules = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return next((packages[top] for name in modules if (top := name.partition(".")[0]) in packages), None)
 
 
 def _variables(error: Exception) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from cleargs.errors import InputError, StageError
 from cleargs.plugins import load_plugin
 from cleargs.types import ArrayF64, ImageF32
 
@@ -85,10 +86,26 @@ REFUSED = "repair refused: "
 def candidate(name: str) -> Candidate:
     """Return the candidate ``name`` of `CANDIDATES` or of another package.
 
-    Raises InputError if no package provides it.
+    Raises InputError if no package provides it, or provides something else.
     """
-    found: Candidate = CANDIDATES[name] if name in CANDIDATES else load_plugin("candidates", name)
+    found = CANDIDATES[name] if name in CANDIDATES else load_plugin("candidates", name)
+    if not isinstance(found, Candidate):
+        hint = "its entry point must name a cleargs.rivr.candidates.Candidate"
+        raise InputError(f"the plugin {name} is not a candidate", hint=hint)
     return found
+
+
+def made_image(image: ImageF32, like: ImageF32, maker: str) -> ImageF32:
+    """Return the ``image`` that ``maker`` made.
+
+    Raises StageError if it is not finite, or not as large as ``like``.
+    """
+    if np.shape(image) != like.shape or not np.isfinite(image).all():
+        raise StageError(
+            f"{maker} made an image of {np.shape(image)} in place of a finite one of {like.shape}",
+            hint="repair it, or choose another one",
+        )
+    return image
 
 
 def phrase_of(chosen: str) -> str:

@@ -29,6 +29,7 @@ from cleargs.rivr.candidates import (
     decide,
     hide_masked,
     is_negligible_change,
+    made_image,
 )
 from cleargs.rivr.config import RepairConfig
 from cleargs.rivr.gates import rejection_reason
@@ -72,7 +73,8 @@ class RepairContext:
         return self._restored(deblurred.image), "deblurred", deblurred
 
     def _restored(self, image: ImageF32) -> ImageF32:
-        return self.expert.restore(image, threads=self.threads)
+        restored = self.expert.restore(image, threads=self.threads)
+        return made_image(restored, image, f"the expert {self.expert.name}")
 
     def _restored_observed(self, view: TrainingView) -> ImageF32:
         """Return D_t of a frame image from the cache: all rounds and resumed runs have the same bits."""
@@ -135,7 +137,9 @@ def repair(
     config, threads = context.config, context.threads
     stored = (from_layer(layers["render"]), from_layer(layers["restored"]))
     materials = Materials(*stored, observed, config.fuse_sigma)
-    layers |= {name: to_layer(candidate(name).make(materials)) for name in config.candidates}
+    for name in config.candidates:
+        made = made_image(candidate(name).make(materials), rendered, f"the candidate {name}")
+        layers[name] = to_layer(made)
     shown = {name: hide_masked(from_layer(layer), observed, mask) for name, layer in layers.items()}
     judged = shown | ({OBSERVED: observed} if config.keep_raw else {})
     primary, tiebreak = (
