@@ -274,6 +274,7 @@ States:
   outdated  results exist, of other settings, inputs or libraries; the line shows what changed. They can be
             used; the next run makes new ones
   missing   no results
+  running   a process works on it now
   packed    results in a run of `cleargs pack`, which cannot be continued
 """
 )
@@ -305,7 +306,12 @@ def status(dag: Stages, run: Path, store: Path | None, as_json: bool) -> None:
     plans = _with_outdated(plans, settings.folder, dag)
     if at_work := stage_at_work(settings.folder, settings.store):
         name, text = at_work
-        plans = [replace(plan, reasons=(text,)) if plan.stage == name else plan for plan in plans]
+        words = (text.removeprefix("running: "),)
+        for place, plan in enumerate(plans):
+            if plan.stage == name and words == (text,):
+                plans[place] = replace(plan, reasons=words)
+            elif plan.stage == name:
+                plans[place] = replace(plan, state="running", reasons=words)
     print_plans(plans, as_json, settings.stages(dag))
 
 

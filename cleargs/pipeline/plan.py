@@ -39,7 +39,7 @@ NO_RESULTS = "no results yet"
 Origins = dict[str, dict[str, str]]
 """Input ("STAGE/PATH") or role of an external -> relative path of a file -> its digest."""
 
-State = Literal["done", "partial", "missing", "outdated", "packed"]
+State = Literal["done", "partial", "missing", "outdated", "running", "packed"]
 """``partial``: the results exist, but the stage could not make all of them. ``packed``: those that
 ``cleargs pack`` took exist, and nothing can be run."""
 

@@ -41,6 +41,9 @@ def test_an_active_run_is_visible_until_it_ends(bench: Bench, capsys: pytest.Cap
     assert invoke(["show", str(bench.folder)], bench.dag) == 0
     said = capsys.readouterr().out
     assert "square is running: square" in said and f"preview: {preview.path}" in said
+    assert invoke(["status", str(bench.folder)], bench.dag) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("square ")]
+    assert line.split()[1] == "running" and "missing" not in line
     hold.unlink()
     assert process.wait(60) == 0
     assert running_stage(bench.folder, bench.store) is None and not (bench.folder / PROGRESS_FILE).exists()
