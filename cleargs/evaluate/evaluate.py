@@ -114,7 +114,8 @@ def _evaluate(
     save: Path | None,
 ) -> Evaluation:
     """Make predictions one after the other (a render uses all threads), and measure them in parallel."""
-    measures = metrics.load_metrics(options)
+    with reporter.task("loading the metrics"):
+        measures = metrics.load_metrics(options)
     if save is not None:
         with disk_errors(save):
             save.mkdir(parents=True, exist_ok=True)

@@ -47,6 +47,7 @@ from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.motion import readout_of
 from cleargs.media.exr import write_depth
 from cleargs.media.image import read_rgb, to_uint8, write_mask, write_rgb
+from cleargs.progress import reporter_of
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
@@ -344,7 +345,10 @@ def test_saved_renders_evaluate_to_the_same(tmp_path: Path) -> None:
         reporter=Remarks(),
         save=tmp_path / "saved",
     )
-    again = evaluate_images(tmp_path / "saved", reference, options=PLAIN, threads=1, reporter=Remarks())
+    lines = list[str]()
+    told = reporter_of(lines.append)
+    again = evaluate_images(tmp_path / "saved", reference, options=PLAIN, threads=1, reporter=told)
+    assert lines[0] == "loading the metrics: started", "for ten seconds on a busy machine there was no line"
     assert again.means == saved.means and again.split == saved.split
     assert [i.prediction for i in again.images] == [i.prediction for i in saved.images]
 
