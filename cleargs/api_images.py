@@ -59,15 +59,18 @@ def score_frames(
     import pyarrow as pa
 
     from cleargs.rva.allocation import appearance_scores
-    from cleargs.rva.evaluator import EvaluatedFrame
+    from cleargs.rva.evaluator import EvaluatedFrame, evaluated
     from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.tables import CUE_COLUMNS
 
     config: Any = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
     with tempfile.TemporaryDirectory() as cache:
         views = [EvaluatedFrame(number, Path(path)) for number, path in enumerate(paths)]
-        cues = make_evaluator(config, cache=Path(cache)).evaluate(
-            views, threads=threads or usable_cores(), reporter=reporter_of(progress)
+        cues = evaluated(
+            make_evaluator(config, cache=Path(cache)),
+            views,
+            threads=threads or usable_cores(),
+            reporter=reporter_of(progress),
         )
     R, B = appearance_scores(cues, config)
     columns = dict(zip(CUE_COLUMNS, cues.T, strict=True))

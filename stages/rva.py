@@ -62,7 +62,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.parquet import write_table
     from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from, summary
-    from cleargs.rva.evaluator import EvaluatedFrame, label
+    from cleargs.rva.evaluator import EvaluatedFrame, evaluated, label
     from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.hidden import with_hidden_parts
     from cleargs.rva.tables import BINS, FRAMES
@@ -76,7 +76,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
         EvaluatedFrame(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
         for frame in frames
     ]
-    cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)
+    cues = evaluated(evaluator, views, threads=context.threads, reporter=context.reporter)
     cues = with_hidden_parts(cues, frames, load_points(ingest), observations)
     frame_id = np.array([frame.frame_id for frame in frames], dtype=np.int32)
     result = assess(frame_id, cues, poses_from(frames), observations, config)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -22,6 +23,7 @@ from cleargs.pipeline.stages import installed
 from cleargs.plugins import plugins
 from cleargs.progress import SilentReporter
 from cleargs.rivr.candidates import Materials, candidate, made_image
+from cleargs.rva.evaluator import EvaluatedFrame, evaluated
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.formation import Formation
@@ -124,6 +126,15 @@ def test_evaluator(parts: Path, tmp_path: Path, picture: np.ndarray) -> None:
     assert table["r_sharpness"].to_pylist() == [1.0, 0.0] and table["B"].to_pylist()[0] == 0.0
     with pytest.raises(ConfigError, match="contrasts"):
         cg.score_frames([], evaluator="contrasts")
+
+
+@pytest.mark.parametrize("cues", [np.zeros((1, 11)), np.zeros((2, 10)), np.full((2, 11), 1.5)])
+def test_an_evaluator_that_returns_no_cues_is_named(cues: np.ndarray) -> None:
+    """Too few rows ended in "operands could not be broadcast together", and the request to report it."""
+    wrong: Any = SimpleNamespace(name="contrast", version=1, evaluate=lambda views, **options: cues)
+    views = [EvaluatedFrame(number, Path("x.png")) for number in range(2)]
+    with pytest.raises(StageError, match="the evaluator contrast returned no cues"):
+        evaluated(wrong, views, threads=1, reporter=SilentReporter())
 
 
 def test_a_missing_frame_is_an_error_with_its_name(tmp_path: Path) -> None:

@@ -13,10 +13,11 @@ from typing import Protocol
 import numpy as np
 
 from cleargs.digest import file_digest
-from cleargs.errors import InputError, StoreError
+from cleargs.errors import InputError, StageError, StoreError
 from cleargs.files import write_json
 from cleargs.media.image import read_mask, read_rgb
 from cleargs.progress import Reporter
+from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.safe_io import read_json
 from cleargs.types import ArrayF64, ImageU8, MaskU8
 
@@ -64,6 +65,21 @@ class Evaluator(Protocol):
         their number. The result does not depend on ``threads``. ``reporter`` receives the progress, and a
         warning for each frame that could not be scored.
         """
+
+
+def evaluated(
+    evaluator: Evaluator, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter
+) -> ArrayF64:
+    """Return the cues [n, 11] of frames, as `Evaluator.evaluate`; raise StageError if they are none."""
+    cues = np.asarray(evaluator.evaluate(views, threads=threads, reporter=reporter), np.float64)
+    expected = (len(views), len(CUE_COLUMNS))
+    if cues.shape != expected or not bool((np.isnan(cues) | ((cues >= 0.0) & (cues <= 1.0))).all()):
+        raise StageError(
+            f"the evaluator {evaluator.name} returned no cues: an array of the shape {cues.shape}"
+            + (", with values outside 0 to 1" if cues.shape == expected else f", not {expected}"),
+            hint="correct its package, or set rva.evaluator to another one",
+        )
+    return cues
 
 
 def label(evaluator: Evaluator) -> str:
