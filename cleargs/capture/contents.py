@@ -11,35 +11,24 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from filecmp import cmp
 from pathlib import Path
 
 from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
+from cleargs.capture.copies import FEW, copies_of, previews_of, second_videos
 from cleargs.capture.file_names import (
     BAND,
-    BLURRED,
     INFRARED_NAME,
-    MAP,
-    MASK_FOLDER,
-    PREVIEW,
-    PROCESSED,
     PRODUCT_NAME,
-    SECOND,
     SMALL_VIDEO,
     SPOT_NAME,
     SYSTEM,
+    names_below,
     of_shot,
+    without,
 )
-from cleargs.capture.folders import (
-    frame_key,
-    is_wanted,
-    mask_externals,
-    masks_by_number,
-    masks_of,
-    natural_key,
-    unmasked,
-)
+from cleargs.capture.folders import frame_key, is_wanted, mask_externals, natural_key
+from cleargs.capture.mask_files import folder_of_masks, masks_by_place, masks_by_stem, masks_of_photographs
 from cleargs.capture.pairs import second_views
 from cleargs.digest import files_under
 from cleargs.errors import InputError
@@ -49,17 +38,9 @@ from cleargs.media.headers import Header, lacks_package, read_header
 FEWEST = 3
 """A folder with fewer photographs is read as something else, if it has something else."""
 
-_SMALL, _FEW = 0.5, 0.25
-"""Pictures whose long side is at most this share of the others' are previews if they are at most this share
-of their number, or if they have the numbers of others in their names."""
-
-_REDUCED = 0.75  # share of the long side up to which a folder with the names of another one has copies
-
 LISTS = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "sparse")
 """Files and folders with poses, by which a folder is a capture."""
 
-WHITE, MASK_SHARE = 255, 0.95
-"""Level of white, and least share of black and white pixels in a mask; edges may be smooth."""
 MASKS, DEPTH, GREY, INFRARED = "mask%s", "depth map%s", "picture%s of one channel", "infrared picture%s"
 ALONE = "mask%s without a photograph of the same name"
 BELOW = "video%s in folders below"
@@ -175,14 +156,14 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
         )
     left_out: dict[str, Sequence[Path]] = {UNWANTED: sorted(set(found) - set(wanted))}
     left_out[BROKEN] = [path for path in wanted if not path.is_file()]
-    wanted = _without(wanted, left_out[BROKEN])
+    wanted = without(wanted, left_out[BROKEN])
     videos = [path for path in wanted if path.suffix.lower() in VIDEO_SUFFIXES]
-    small, copies = _small_videos(videos, root), _second_videos(videos)
-    videos = _without(videos, [*small, *copies])
+    small, copies = _small_videos(videos, root), second_videos(videos)
+    videos = without(videos, [*small, *copies])
     second_clips = second_views(videos, root)
-    videos = _without(videos, second_clips)
+    videos = without(videos, second_clips)
     top = [path for path in videos if path.parent == root] or videos
-    left_out[BELOW] = _without(videos, top)
+    left_out[BELOW] = without(videos, top)
     videos = sorted(top, key=lambda path: natural_key(path.relative_to(root).as_posix()))
     images = [path for path in wanted if path.suffix.lower() in IMAGE_SUFFIXES]
     raw = [path for path in wanted if path.suffix.lower() in RAW_SUFFIXES]
@@ -192,52 +173,52 @@ def contents_of(root: Path, config: CaptureConfig) -> Contents:
     left_out[UNREADABLE] = [path for path in images if lacks_package(path)]
     if len(left_out[UNREADABLE]) == len(images):  # reading the first one names the remedy
         left_out[UNREADABLE] = []
-    images = _without(images, left_out[UNREADABLE])
+    images = without(images, left_out[UNREADABLE])
     inside = {path for path in images if path.parts[len(root.parts)] == "images" and path.parent != root}
     if inside:
         # The place of the images in all layouts: what is elsewhere was put there on purpose.
-        left_out[OUTSIDE] = [p for p in images if p not in inside and not _mask_folder(p, root)]
-        images = _without(images, left_out[OUTSIDE])
+        left_out[OUTSIDE] = [p for p in images if p not in inside and not folder_of_masks(p, root)]
+        images = without(images, left_out[OUTSIDE])
     left_out[OTHERS] = _of_other_captures(images, root, few=not videos)
-    images = _without(images, left_out[OTHERS])
-    left_out[MASKS] = _masks(images, root)
-    headers = {path: read_header(path) for path in _without(images, left_out[MASKS])}
+    images = without(images, left_out[OTHERS])
+    left_out[MASKS] = masks_by_place(images, root)
+    headers = {path: read_header(path) for path in without(images, left_out[MASKS])}
     left_out[SPECTRAL] = [path for path, header in headers.items() if header and header.spectral]
     if left_out[SPECTRAL] and len(left_out[SPECTRAL]) == len(headers) and not videos:
         raise InputError(f"{root} has only {SPECTRAL % 's'}", hint=_HINTS[SPECTRAL])
-    headers = {path: headers[path] for path in _without([*headers], left_out[SPECTRAL])}
+    headers = {path: headers[path] for path in without([*headers], left_out[SPECTRAL])}
     for kind, names in ((SPOT, SPOT_NAME), (INFRARED, INFRARED_NAME)):
         left_out[kind] = _by_name(names, headers, root)
-        headers = {path: headers[path] for path in _without([*headers], left_out[kind])}
-    masks = _masks_by_stem(headers)
+        headers = {path: headers[path] for path in without([*headers], left_out[kind])}
+    masks = masks_by_stem(headers)
     left_out[MASKS] = [*left_out[MASKS], *masks]
-    images, deep, left_out[GREY] = _by_channels({path: headers[path] for path in _without([*headers], masks)})
+    images, deep, left_out[GREY] = _by_channels({path: headers[path] for path in without([*headers], masks)})
     left_out[DEEP_TIFF] = [path for path in deep if path.suffix.lower() in (".tif", ".tiff")]
-    left_out[DEPTH] = _without(deep, left_out[DEEP_TIFF])
+    left_out[DEPTH] = without(deep, left_out[DEEP_TIFF])
     left_out[BANDS] = _other_bands([path for path in images if _is_grey(headers[path])])
-    images = _without(images, left_out[BANDS])
-    previews = _previews(images, headers, root, few=not videos)
+    images = without(images, left_out[BANDS])
+    previews = previews_of(images, headers, root, few=not videos)
     left_out[PREVIEWS] = [*previews, *small]
-    images = _without(images, previews)
+    images = without(images, previews)
     products = [path for path in images if PRODUCT_NAME.fullmatch(path.stem) or _is_texture(path)]
-    left_out[PRODUCTS] = products if len(products) <= _FEW * (len(images) - len(products)) else []
-    images = _without(images, left_out[PRODUCTS])
+    left_out[PRODUCTS] = products if len(products) <= FEW * (len(images) - len(products)) else []
+    images = without(images, left_out[PRODUCTS])
     views = second_views(images, root)
     left_out[VIEWS] = [*second_clips, *views]
-    images = _without(images, views)
-    second = _copies(images, headers)
-    left_out[COPIES] = [*second, *copies, *_without(raw, left_out[RAW])]
-    images = _without(images, second)
+    images = without(images, views)
+    second = copies_of(images, headers)
+    left_out[COPIES] = [*second, *copies, *without(raw, left_out[RAW])]
+    images = without(images, second)
     only_maps = any(header and header.deep for header in headers.values())
     only_maps &= all(_is_grey(headers[path]) for path in images)
     is_video = bool(videos) and (len(images) < FEWEST or only_maps)
     left_out[PHOTOGRAPHS if is_video else VIDEOS] = images if is_video else videos
     images.sort(key=lambda path: frame_key(path.relative_to(root).as_posix()))
     made = Contents(root, images, videos, {}, left_out, is_video)
-    made = replace(made, masks=_paired(made, left_out[MASKS]))
+    made = replace(made, masks=masks_of_photographs(images, made.folder, root, left_out[MASKS]))
     used = list(made.masks.values())
-    alone = [] if is_video else _without(left_out[MASKS], used)
-    left_out[MASKS] = _without(left_out[MASKS], alone)
+    alone = [] if is_video else without(left_out[MASKS], used)
+    left_out[MASKS] = without(left_out[MASKS], alone)
     kind = ALONE if len(wanted) == len(found) else UNWANTED  # their photographs may not be wanted
     left_out[kind] = [*left_out.get(kind, ()), *alone]
     return made
@@ -251,23 +232,6 @@ def media_files(root: Path) -> list[Path]:
     return sorted(files, key=lambda path: (path.parent, path.name))
 
 
-def _without(files: Sequence[Path], others: Sequence[Path]) -> list[Path]:
-    gone = set(others)
-    return [path for path in files if path not in gone]
-
-
-def _parts(path: Path, root: Path) -> tuple[str, ...]:
-    """Return the names of the folders below ``root`` on the way to ``path``, and its stem."""
-    return path.relative_to(root).with_suffix("").parts
-
-
-def _mask_folder(path: Path, root: Path) -> Path | None:
-    """Return the folder of masks below ``root`` that has the file ``path``, or None."""
-    depth = len(root.parts)
-    found = (n for n, part in enumerate(path.parts[depth:-1], depth) if MASK_FOLDER.fullmatch(part))
-    return next((Path(*path.parts[: n + 1]) for n in found), None)
-
-
 def _of_other_captures(images: Sequence[Path], root: Path, *, few: bool) -> list[Path]:
     """Return the pictures in folders below ``root`` that have poses, such as exports.
 
@@ -279,67 +243,10 @@ def _of_other_captures(images: Sequence[Path], root: Path, *, few: bool) -> list
     return found if len(images) - len(found) >= FEWEST or not few else []
 
 
-def _masks(images: Sequence[Path], root: Path) -> list[Path]:
-    """Return the masks among ``images``, by their folders and names. If all would be masks, none is one."""
-    stems = {path.with_suffix("") for path in images}
-    masks = [
-        path
-        for path in images
-        if _mask_folder(path, root) or (unmasked(path) != path.with_suffix("") and unmasked(path) in stems)
-    ]
-    return masks if len(masks) < len(images) else []
-
-
-def _masks_by_stem(headers: Mapping[Path, Header | None]) -> list[Path]:
-    """Return the PNG files that are masks of a photograph of the same stem and size in their folder.
-
-    The first one of each folder decides.
-    """
-    shots = {p.with_suffix(""): p for p, header in headers.items() if p.suffix.lower() in (".jpg", ".jpeg")}
-    masks: dict[Path, list[Path]] = defaultdict(list)
-    for path, header in headers.items():
-        shot = headers.get(shots.get(path.with_suffix(""), path))
-        if (
-            path.suffix.lower() == ".png"
-            and header
-            and shot
-            and header is not shot
-            and header.size == shot.size
-        ):
-            masks[path.parent].append(path)
-    return [path for paths in masks.values() if _looks_like_a_mask(paths[0]) for path in paths]
-
-
-def _looks_like_a_mask(path: Path) -> bool:
-    """Return True for a picture in black and white, or one whose pixels are white where it is opaque."""
-    from cleargs.media.image import read_alpha, read_grey
-
-    try:
-        levels, alpha = read_grey(path), read_alpha(path, upright=False)
-    except InputError:
-        return False
-    if alpha is not None and not alpha.all():
-        return bool((levels[alpha > 0] == WHITE).all())
-    return bool(((levels == 0) | (levels == WHITE)).mean() > MASK_SHARE)
-
-
-def _paired(contents: Contents, masks: Sequence[Path]) -> dict[Path, Path]:
-    """Return photograph -> its mask, in a folder of masks or next to it (``NAME_mask.png``)."""
-    by_stem = {path.with_suffix(""): path for path in contents.photographs}
-    root = contents.folder
-    names = {path.relative_to(root).as_posix(): path for path in contents.photographs}
-    found = {by_stem[unmasked(mask)]: mask for mask in masks if unmasked(mask) in by_stem}
-    for folder in dict.fromkeys(_mask_folder(mask, contents.root) for mask in masks):
-        if folder is not None:
-            of = masks_of(folder, list(names)) or masks_by_number(folder, list(names))
-            found |= {names[name]: mask for name, mask in of.items()}
-    return found
-
-
 def _by_name(names: re.Pattern[str], headers: Mapping[Path, Header | None], root: Path) -> list[Path]:
     """Return the pictures named so, in any format. If there are few others in colour, none is returned."""
-    found = [path for path in headers if any(map(names.fullmatch, _parts(path, root)))]
-    colour = [path for path in _without(list(headers), found) if not _is_grey(headers[path])]
+    found = [path for path in headers if any(map(names.fullmatch, names_below(path, root)))]
+    colour = [path for path in without(list(headers), found) if not _is_grey(headers[path])]
     return found if len(colour) >= FEWEST else []
 
 
@@ -354,7 +261,7 @@ def _by_channels(headers: Mapping[Path, Header | None]) -> tuple[list[Path], lis
     """
     deep = [path for path, header in headers.items() if header is not None and header.deep]
     grey = [path for path, header in headers.items() if header is not None and header.grey]
-    colour = _without(_without(list(headers), deep), grey)
+    colour = without(without(list(headers), deep), grey)
     if len(colour) >= FEWEST or not (grey or deep):
         return colour, deep, grey
     return ([*colour, *grey], deep, []) if grey else ([*colour, *deep], [], [])
@@ -380,105 +287,5 @@ def _other_bands(images: Sequence[Path]) -> list[Path]:
 
 def _small_videos(videos: Sequence[Path], root: Path) -> list[Path]:
     """Return the videos named as previews or proxies of others; none if there are no others."""
-    small = [path for path in videos if any(map(SMALL_VIDEO.fullmatch, _parts(path, root)))]
+    small = [path for path in videos if any(map(SMALL_VIDEO.fullmatch, names_below(path, root)))]
     return small if len(small) < len(videos) else []
-
-
-def _second_videos(videos: Sequence[Path]) -> list[Path]:
-    """Return the smaller ones of files with one stem in one folder: a video in two formats."""
-    largest: dict[Path, Path] = {}
-    for path in sorted(videos, key=lambda path: -path.stat().st_size):
-        largest.setdefault(path.with_suffix(""), path)
-    return _without(videos, list(largest.values()))
-
-
-def _previews(
-    images: Sequence[Path], headers: Mapping[Path, Header | None], root: Path, *, few: bool
-) -> list[Path]:
-    """Return pictures that are much smaller than the others and few, or have the numbers of others.
-
-    Those with names of previews count too, if they are ``few`` or that does not matter (next to videos).
-    """
-    sizes = {path: header.size for path in images if (header := headers[path]) is not None}
-    counts = Counter(sizes.values())
-    if not counts:
-        return []
-    main = max(counts, key=lambda size: (counts[size] * size[0] * size[1], size))
-    others = [path for path, size in sizes.items() if max(size) > _SMALL * max(main)]
-    numbers = {(path.parent, *re.findall(r"\d+", path.stem)) for path in others}
-    small = [path for path in sizes if max(sizes[path]) <= _SMALL * max(main)]
-    paired = [path for path in small if (path.parent, *re.findall(r"\d+", path.stem)) in numbers]
-    found = small if len(small) <= _FEW * len(others) else paired
-    named = [path for path in others if any(map(PREVIEW.search, _parts(path, root)[-2:]))]
-    return sorted({*found, *(named if not few or len(named) <= _FEW * len(others) else [])})
-
-
-def _copies(images: Sequence[Path], headers: Mapping[Path, Header | None]) -> list[Path]:
-    """Return pictures of folders that have the names of another folder in a smaller size or another format.
-
-    Second copies in one folder (``IMG_1.HEIC`` next to ``IMG_1.JPG``) count too.
-    """
-    stems: dict[Path, Path] = {}
-    second = [path for path in images if stems.setdefault(path.with_suffix(""), path) is not path]
-    second += [path for path in _without(images, second) if _is_second(path, stems)]
-    second += _maps(_without(images, second))
-    folders: dict[Path, dict[str, Path]] = defaultdict(dict)
-    for path in _without(images, second):
-        folders[path.parent][path.stem.lower()] = path
-    kept: list[dict[str, Path]] = []
-
-    def rank(folder: Path) -> tuple[bool, int]:
-        pixels = sum(_pixels(headers[path]) for path in folders[folder].values())
-        return bool(PROCESSED.search(folder.name)), -pixels
-
-    for folder in sorted(folders, key=rank):
-        files = folders[folder]
-        if any(
-            all(name in other and _is_copy(path, other[name], headers) for name, path in files.items())
-            for other in kept
-        ):
-            second += files.values()
-        else:
-            kept.append(files)
-    return second
-
-
-def _maps(images: Sequence[Path]) -> list[Path]:
-    """Return pictures named, or in folders named, as normals, labels or depth, with the number of another."""
-    maps = [path for path in images if MAP.fullmatch(path.stem) or MAP.fullmatch(path.parent.name)]
-    numbers = {_numbers(path) for path in _without(images, maps)} - {()}
-    return [
-        path for path in maps if any(_numbers(path)[: n + 1] in numbers for n in range(len(_numbers(path))))
-    ]
-
-
-def _numbers(path: Path) -> tuple[str, ...]:
-    return tuple(re.findall(r"\d+", path.stem))
-
-
-def _is_second(path: Path, stems: Mapping[Path, Path]) -> bool:
-    """Return True if ``path`` is named as an edited version of one of ``stems``, or is a second download."""
-    for pattern, sharp in BLURRED:
-        if (cover := pattern.fullmatch(path.stem)) and path.with_name(cover.expand(sharp)) in stems:
-            return True
-    if (found := SECOND.fullmatch(path.stem)) is None:
-        return False
-    first = stems.get(path.with_name(f"IMG_{found[1]}" if found[1] else found[2] or found[3]))
-    return first is not None and (found[3] is None or cmp(path, first, shallow=False))
-
-
-def _pixels(header: Header | None) -> int:
-    return 0 if header is None else header.size[0] * header.size[1]
-
-
-def _is_copy(path: Path, other: Path, headers: Mapping[Path, Header | None]) -> bool:
-    """Return True if ``path`` is ``other`` in a smaller size, processed, in another format, or as it is."""
-    own, its = headers[path], headers[other]
-    if own is None or its is None:
-        return False
-    (w, h), (width, height) = own.size, its.size
-    alike = abs(w * height - h * width) <= max(width, height) + max(w, h)
-    smaller = max(w, h) <= _REDUCED * max(width, height)
-    processed = bool(PROCESSED.search(path.parent.name))
-    changed = smaller or processed or path.suffix.lower() != other.suffix.lower()
-    return alike and (changed or cmp(path, other, shallow=False))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 SYSTEM = re.compile(r"[.@#]|(__MACOSX|MeshroomCache|odm_\w+|.+\.(files|cmvs))$")
@@ -41,3 +42,14 @@ SMALL_VIDEO = _words("lrv|proxy|proxies|low.?res")
 def of_shot(path: Path) -> Path:
     """Return ``path`` without its ending and what a Pixel adds for raw photographs and their JPEGs."""
     return path.with_name(re.sub(r"\.RAW-\d+(\.MP)?\.(COVER|ORIGINAL)$", "", path.stem))
+
+
+def names_below(path: Path, root: Path) -> tuple[str, ...]:
+    """Return the names of the folders below ``root`` on the way to ``path``, and its stem."""
+    return path.relative_to(root).with_suffix("").parts
+
+
+def without(files: Sequence[Path], others: Sequence[Path]) -> list[Path]:
+    """Return ``files`` without ``others``, in their order."""
+    gone = set(others)
+    return [path for path in files if path not in gone]

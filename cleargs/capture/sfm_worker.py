@@ -1,8 +1,8 @@
 """The COLMAP side of ingest: ``python -m cleargs.capture.sfm_worker job.json``, run by `cleargs.capture.sfm`.
 
 It reads its job from JSON, works in ``job["folder"]`` and writes a binary model to ``folder/model``. Features
-and matches (`cleargs.capture.sfm_features`) of a killed run are used again. Frames that mapping leaves out
-are tried again with other features.
+and matches (`cleargs.capture.sfm_features`) of a killed run are used again. `cleargs.capture.mapping` places
+the frames.
 
 The result is the same for any number of threads: ids are given in frame order before any thread starts, every
 random choice is seeded, frames are matched by processes, and mapping and triangulation (whose least squares
@@ -11,12 +11,10 @@ sum in thread order) run on one thread.
 
 from __future__ import annotations
 
-import copy
 import filecmp
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from itertools import count
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +25,13 @@ from cleargs.capture.camera_models import FIRST_LENS, FISHEYE
 from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.database import (
-    colmap_cameras,
-    copy_features,
-    copy_without_features,
-    create_database,
-    set_cameras,
-    why_missing,
-)
-from cleargs.capture.kept_out import (
-    all_tracks,
-    epipolar_errors,
-    fitting_shares,
-    verified_matches,
-    weakest_join,
-)
+from cleargs.capture.database import colmap_cameras, copy_features, create_database, set_cameras
+from cleargs.capture.kept_out import all_tracks, epipolar_errors, verified_matches, weakest_join
 from cleargs.capture.lenses import FISHEYE_AHEAD, GAIN, Fit, fitted, searched
+from cleargs.capture.mapping import Mapper, names_in
 from cleargs.capture.parallax import LITTLE_BELOW, NO_DEPTH_BELOW, depth_share
 from cleargs.capture.prediction import scales_differ
-from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
+from cleargs.capture.sfm_features import FIRST
 from cleargs.capture.sfm_job import LITTLE_DEPTH, MOVE, NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
 from cleargs.capture.steady import steadied
 from cleargs.capture.unturned import TURNED, USUAL_FOCAL, refocused, turned
@@ -53,9 +39,6 @@ from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
 
-_MIN_MODEL = 10
-"""Minimum number of frames of a model: COLMAP discards a smaller model and starts elsewhere. In a short
-capture the minimum is a third of the frames, since a model of 8 of 12 frames is useful."""
 _CONVINCING, _UNEXPLAINED, _EXPLAINED = 0.3, 0.05, 1.3
 """Other poses and cameras replace given ones if the median error of the kept-out matches falls to a share of
 the error before: `_CONVINCING`, or `_UNEXPLAINED` if the new error is above `_EXPLAINED` times the error with
@@ -64,13 +47,6 @@ than given ones, unless these are far off. All three, and the next, are from doc
 _NEARER = 0.9
 """SfM is preferred to adjusted poses only if it lowers the mean error to at most this share. If both are
 right, they are alike, and only adjusted poses are exactly in the user's world."""
-_JOINED, _JOINS = 0.92, 3
-"""Minimum share of the matches across a join (`weakest_join`) that hold, and maximum number of joins that are
-repeated (docs/experiments/poses.md)."""
-_MISPLACED, _PLACINGS, _LEFT_OUT = 0.6, 2, 0.1
-"""Minimum share of a frame's matches that fit its pose; how many times frames with less are placed again;
-maximum share of all frames that are then left out. If there are more, the matches are wrong, not the poses
-(docs/experiments/poses.md)."""
 _FITS_PX, _FITS = 2.0, 0.5
 """Poses fit the images if at least this share of the matches is within this distance, px, of its epipolar
 line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes, 0.13 with inverted ones."""
@@ -88,23 +64,8 @@ def main() -> int:
     return 0
 
 
-class Sfm(Features):
+class Sfm(Mapper):
     """The steps of a job."""
-
-    def __init__(self, job: Job, report: Callable[..., None]) -> None:
-        super().__init__(job, report)
-        self.used_database = self.database
-        """The database with the features by which frames were placed."""
-        self._elsewhere: set[str] = set()
-        """Images of the second-largest model of the first mapping."""
-        self._settled: tuple[pycolmap.Reconstruction, Path] | None = None
-        """Model and database of the last call of `_rejoined`, if another call would find the same."""
-        self.output = job.folder / "model.partial"
-        self._options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=job.seed)
-        self._options.extract_colors = False
-        self._options.mapper.num_threads = 1
-        self._options.mapper.random_seed = job.seed
-        self._options.triangulation.random_seed = job.seed
 
     def run(self) -> None:
         """Make the model and its `SfmOutcome`. Raises StageError if the frames give none."""
@@ -187,7 +148,7 @@ class Sfm(Features):
             method="sfm",
             lens=lens_of(model),
             torn_at=join - 1 if torn else None,
-            elsewhere=sorted(tried._elsewhere - _names_in(model)),
+            elsewhere=sorted(tried.elsewhere - names_in(model)),
             focal_open=focal_open,
             little_depth=deep <= LITTLE_BELOW,
             shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
@@ -346,177 +307,6 @@ class Sfm(Features):
         model, _ = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
         align_to(model, given, model.images.values())
         return model, placed
-
-    def mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Return the model of the images alone, and how frames were placed."""
-        model = self._rejoined(self._corrected(self._map(), self.database), self.database)
-        model, placed = self._place_the_rest(model, pairs)
-        before = _names_in(model)
-        model = self._corrected(self._rejoined(model, self.used_database), self.used_database)
-        return model, placed | dict.fromkeys(before - _names_in(model), "too few of its matches fit its pose")
-
-    def _corrected(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
-        """Return ``model`` after frames that contradict their matches were placed again, or left out.
-
-        A frame may be placed by wrong matches before the frames with right matches to it have a pose.
-        """
-        matches = verified_matches(database)
-        shares = fitting_shares(model, matches)
-        for _ in range(_PLACINGS):
-            wrong = {image - 1 for image, share in shares.items() if share < _MISPLACED}
-            if not wrong:
-                break
-            self._report(phase="placing frames again", total=None)
-            found = self._continued(model, database, wrong, FIRST)
-            better = fitting_shares(found, matches)
-            if len(better) < len(shares) or min(better.values()) <= min(shares.values()):
-                break
-            model, shares = found, better
-        contrary = [image for image, share in shares.items() if share < _MISPLACED]
-        if contrary and len(contrary) <= _LEFT_OUT * len(shares):
-            model = copy.deepcopy(model)
-            for image in contrary:
-                model.deregister_frame(model.images[image].frame_id)
-        return model
-
-    def _rejoined(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
-        """Return ``model`` after the joins that contradict the matches across them were repeated.
-
-        The first pair of mapping may get a wrong focal length and depth, with which the first frames fit each
-        other; the next ones then go on at another scale. The smaller side of such a join is placed again from
-        the larger one.
-        """
-        if self._settled is not None and self._settled[0] is model and self._settled[1] == database:
-            return model  # no frame was placed in between
-        image, share = weakest_join(model, database)
-        self._settled = None
-        for _ in range(_JOINS):
-            if share >= _JOINED:
-                self._settled = model, database
-                break
-            numbers = {found.image_id - 1 for found in model.images.values() if found.has_pose}
-            before = {i for i in numbers if i < image - 1}
-            self._report(phase="checking a weak join", total=None)
-            found = self._continued(model, database, min(before, numbers - before, key=len), FIRST)
-            again, better = weakest_join(found, database)
-            if better <= share or not _names_in(found) >= _names_in(model):
-                self._settled = model, database
-                break
-            model, image, share = found, again, better
-        return model
-
-    def _map(self) -> pycolmap.Reconstruction:
-        """Run incremental mapping. Return the model with the most registered frames (the first of equals)."""
-        total = len(self.job.names)
-        options = copy.deepcopy(self._options)
-        options.min_model_size = min(_MIN_MODEL, max(3, total // 3))
-        options.max_num_models = 5
-        # COLMAP's 1.1 adjusts the whole model per tenth of growth: half as much time again, equal errors.
-        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
-        self._report(phase="reconstructing", total=total)
-        registered = count(3)  # after the first pair
-
-        def placed() -> None:
-            number = next(registered)
-            if number < total:
-                self._report(done=number)
-            elif number == total:
-                self._report(phase="adjusting all poses", total=None)
-
-        models = pycolmap.incremental_mapping(
-            self.database,
-            self.job.images,
-            self.output,
-            options,
-            initial_image_pair_callback=lambda: self._report(done=2),
-            next_image_callback=placed,
-        )
-        if not models:
-            raise StageError(
-                "no two frames could be matched well enough to start a reconstruction",
-                hint="record more frames with more overlap and texture, "
-                "and move the camera rather than turn it",
-            )
-        first, *others = sorted(models.values(), key=lambda model: -model.num_reg_images())
-        self._elsewhere = _names_in(others[0]) if others else set()
-        return first
-
-    def _place_the_rest(
-        self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
-    ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Continue mapping with other features, by `AGAIN`, while frames have no pose.
-
-        It works in copies of the database, so that a killed run finds the first one unchanged. Returns the
-        model, and for each image how it was placed or why it was not.
-        """
-        names, reach = self.job.names, self.job.config.overlap
-        self.used_database = self.database
-        placed = dict.fromkeys(_names_in(model), FIRST.name)
-        reasons: dict[str, str] = {}
-        for settings in AGAIN:
-            missing = [index for index, name in enumerate(names) if name not in placed]
-            if not missing:
-                break
-            again = set(missing)
-            if settings.neighbours:
-                again = {i for i in range(len(names)) if any(abs(i - j) <= reach for j in missing)}
-            database = self.database.with_name(f"{settings.name.replace(' ', '-')}.db")
-            copy_without_features(self.used_database, database, [index + 1 for index in again])
-            self.extract(database, [names[index] for index in sorted(again)], settings)
-            self.match(database, [pair for pair in pairs if not again.isdisjoint(pair)], " again")
-            self._report(phase="placing frames again", total=None)
-            found = self._continued(model, database, again, settings)
-            if _names_in(found) > placed.keys():
-                model, self.used_database = found, database
-                placed = dict.fromkeys(_names_in(model), settings.name) | placed
-            reasons = why_missing(
-                database, {i + 1: name for i, name in enumerate(names) if name not in placed}
-            )
-        return model, placed | reasons
-
-    def _continued(
-        self, model: pycolmap.Reconstruction, database: Path, again: set[int], settings: FeatureSettings
-    ) -> pycolmap.Reconstruction:
-        """Return ``model`` after mapping from ``database`` placed the frames ``again`` once more."""
-        options = copy.deepcopy(self._options)
-        options.multiple_models = False
-        options.mapper.abs_pose_min_num_inliers = settings.inliers
-        kept = copy.deepcopy(model)
-        for image in model.images.values():
-            if image.image_id - 1 in again and image.has_pose:
-                kept.deregister_frame(image.frame_id)
-        start = self.output / "start"
-        make_folder(start, empty=True)
-        kept.write_binary(start)
-        models = pycolmap.incremental_mapping(
-            database, self.job.images, self.output, options, input_path=start
-        )
-        return max([*models.values(), model], key=lambda model: model.num_reg_images())
-
-    def triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
-        """Return a model with points triangulated at the given poses and cameras, which do not change."""
-        self._report(phase="triangulating", total=None)
-        model = pycolmap.Reconstruction()
-        with pycolmap.Database.open(self.database) as opened:
-            for camera in opened.read_all_cameras():
-                model.add_camera_with_trivial_rig(camera)
-            for image in sorted(opened.read_all_images(), key=lambda image: image.image_id):
-                model.add_image_with_trivial_frame(
-                    pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
-                    pycolmap.Rigid3d(np.array(poses[image.image_id - 1])),
-                )
-        return self.with_points(model, self.database)
-
-    def with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
-        """Return ``model`` with points triangulated again from the matches in ``database``."""
-        set_cameras(database, list(model.cameras.values()))  # COLMAP refuses a model whose lenses differ
-        return pycolmap.triangulate_points(
-            model, database, self.job.images, self.output, options=self._options
-        )
-
-
-def _names_in(model: pycolmap.Reconstruction) -> set[str]:
-    return {image.name for image in model.images.values() if image.has_pose}
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cleargs.capture import sfm, sfm_worker
+from cleargs.capture import mapping, sfm
 from cleargs.capture.adjustment import align_to
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import CaptureConfig, SfmConfig
@@ -38,13 +38,13 @@ def with_first_part_scaled(poses: Poses, first: int, factor: float) -> Poses:
 
 
 @pytest.fixture
-def placer(images: Path, tmp_path: Path) -> sfm_worker.Sfm:
+def placer(images: Path, tmp_path: Path) -> mapping.Mapper:
     """COLMAP's work on ten images, with matches."""
     work = tmp_path / "work"
     work.mkdir()
     frames = prepare(open_capture(images, CaptureConfig()), work, 320, SilentReporter())
     job = sfm.job_of(frames, None, work, SfmConfig(max_features=1024), 0, 1)
-    placer = sfm_worker.Sfm(job, lambda **_: None)
+    placer = mapping.Mapper(job, lambda **_: None)
     pycolmap.set_random_seed(0)
     create_database(placer.database, job)
     placer.extract(placer.database, job.names, FIRST)
@@ -53,7 +53,7 @@ def placer(images: Path, tmp_path: Path) -> sfm_worker.Sfm:
     return placer
 
 
-def moved(placer: sfm_worker.Sfm, right: pycolmap.Reconstruction, poses: Poses) -> pycolmap.Reconstruction:
+def moved(placer: mapping.Mapper, right: pycolmap.Reconstruction, poses: Poses) -> pycolmap.Reconstruction:
     """Return ``right`` at other poses, with its points triangulated there."""
     model = pycolmap.Reconstruction(right)
     for number, pose in poses.items():
@@ -73,17 +73,17 @@ def off(model: pycolmap.Reconstruction, right: pycolmap.Reconstruction) -> list[
 
 
 def test_a_join_is_checked_once_where_nothing_was_placed_in_between(
-    placer: sfm_worker.Sfm, monkeypatch: pytest.MonkeyPatch
+    placer: mapping.Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every capture whose frames were all placed at first printed "checking a weak join" twice."""
     phases: list[str] = []
-    monkeypatch.setattr(sfm_worker, "_JOINED", 1.01)  # all joins are weak
+    monkeypatch.setattr(mapping, "_JOINED", 1.01)  # all joins are weak
     placer._report = lambda **said: phases.append(said.get("phase", ""))
     placer.mapped(placer.pairs())
     assert phases.count("checking a weak join") == 1
 
 
-def test_a_part_at_another_scale_is_placed_again(placer: sfm_worker.Sfm) -> None:
+def test_a_part_at_another_scale_is_placed_again(placer: mapping.Mapper) -> None:
     right = placer._map()
     assert placer._rejoined(right, placer.database) is right
     poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}
@@ -96,7 +96,7 @@ def test_a_part_at_another_scale_is_placed_again(placer: sfm_worker.Sfm) -> None
 
 
 def test_a_frame_that_contradicts_its_matches_is_placed_again_or_left_out(
-    placer: sfm_worker.Sfm, monkeypatch: pytest.MonkeyPatch
+    placer: mapping.Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = placer._map()
     assert placer._corrected(right, placer.database) is right
@@ -111,11 +111,11 @@ def test_a_frame_that_contradicts_its_matches_is_placed_again_or_left_out(
     assert len(found) == 10 and max(found) < 0.02
     monkeypatch.setattr(placer, "_continued", lambda model, *others: model)
     left = placer._corrected(wrong, placer.database)
-    assert sfm_worker._names_in(right) - sfm_worker._names_in(left) == {right.images[5].name}
+    assert mapping.names_in(right) - mapping.names_in(left) == {right.images[5].name}
 
 
 def test_no_frame_is_left_out_where_more_than_a_tenth_contradict_their_matches(
-    placer: sfm_worker.Sfm, monkeypatch: pytest.MonkeyPatch
+    placer: mapping.Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = placer._map()
     poses = {image.image_id: image.cam_from_world().matrix() for image in right.images.values()}

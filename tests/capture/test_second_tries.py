@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cleargs.capture import sfm_worker
+from cleargs.capture import mapping
 from cleargs.capture.config import SfmConfig
 
 from .conftest import Ingest
@@ -19,7 +19,7 @@ from .conftest import Ingest
 NAMES = [f"{index:02d}.png" for index in range(12)]
 
 
-class Placer(sfm_worker.Sfm):
+class Placer(mapping.Mapper):
     """Maps by a script: the numbers of the frames that each try has placed at its end."""
 
     def __init__(self, tries: list[set[int]]) -> None:
@@ -48,8 +48,8 @@ def made(placed: set[int]) -> Any:
 
 @pytest.fixture(autouse=True)
 def no_database(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sfm_worker, "copy_without_features", lambda *_: None)
-    monkeypatch.setattr(sfm_worker, "why_missing", lambda _, missing: dict.fromkeys(missing.values(), "why"))
+    monkeypatch.setattr(mapping, "copy_without_features", lambda *_: None)
+    monkeypatch.setattr(mapping, "why_missing", lambda _, missing: dict.fromkeys(missing.values(), "why"))
 
 
 PAIRS = [(i, i + 1) for i in range(11)]
