@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias
 
 from cleargs.errors import InputError, StoreError
@@ -49,6 +49,15 @@ def file_digest(path: Path) -> str:
 def tree_digest(files: Mapping[str, str]) -> str:
     """Return one digest for many files, given as relative POSIX path -> digest of the content."""
     return json_digest(dict(files))
+
+
+def is_inside(name: str) -> bool:
+    """Return True if a listed ``name`` stays in its folder and is not hidden.
+
+    Only such files are part of a folder's digest.
+    """
+    path = PurePosixPath(name)
+    return not path.is_absolute() and not any(part.startswith(".") for part in path.parts)
 
 
 def files_under(path: Path, left_out: Callable[[Path], bool] = lambda folder: False) -> dict[str, Path]:

@@ -1,8 +1,8 @@
 """Check that a stage whose source changed has a new VERSION, by the lock file ``stages/versions.lock.json``.
 
 The source of a stage is its module and all ClearGS modules that it imports, directly or indirectly, also
-inside functions. It is compared as syntax trees without docstrings, comments and layout. A stage's function
-``estimate`` is left out with its imports, because no result depends on an estimate. ::
+inside functions, except `NO_RESULTS`. It is compared as syntax trees without docstrings, comments and layout.
+A stage's function ``estimate`` is left out with its imports, because no result depends on an estimate. ::
 
     python -m tools.versions                                list changes
     python -m tools.versions --update                       after an increase of VERSION
@@ -28,8 +28,18 @@ from cleargs.pipeline.stages import Stages, installed
 
 LOCK_NAME = "versions.lock.json"
 
-CLI_PACKAGE = "cleargs.cli"
-"""Package of the command line; it does not affect results, so it is not part of any source."""
+NO_RESULTS = (
+    "cleargs.cli",
+    "cleargs.errors",
+    "cleargs.pipeline.stage",
+    "cleargs.progress",
+    "cleargs.subprocesses",
+    "cleargs.timing",
+)
+"""Packages and modules on which no byte of a result depends: the command line, messages, progress, times, how
+child processes are started, and the interface of stages. They are not part of any source."""
+
+_NO_RESULTS = tuple(f"{name}." for name in NO_RESULTS)
 
 ESTIMATE = "estimate"
 """Function of a stage that returns its expected cost. No result depends on it."""
@@ -63,7 +73,7 @@ class Sources:
         while waiting:
             name = waiting.pop()
             file = self.file(name)
-            if file is None or name in digests or f"{name}.".startswith(f"{CLI_PACKAGE}."):
+            if file is None or name in digests or f"{name}.".startswith(_NO_RESULTS):
                 continue
             tree = ast.parse(file.read_bytes())
             if name == module:

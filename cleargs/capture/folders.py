@@ -8,16 +8,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 
 from cleargs.capture.capture import External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.pairs import version_rank
-from cleargs.digest import files_under, has_results
+from cleargs.digest import files_under, has_results, is_inside
 from cleargs.errors import InputError, listed
 from cleargs.media import IMAGE_SUFFIXES
-
-T = TypeVar("T")
+from cleargs.sequences import spread
 
 _MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]masks?)?", re.IGNORECASE)
 
@@ -111,15 +109,6 @@ def is_wanted(path: Path, root: Path, config: CaptureConfig) -> bool:
     return (config.only is None or fits(config.only)) and not (config.skip is not None and fits(config.skip))
 
 
-def is_inside(name: str) -> bool:
-    """Return True if a listed ``name`` stays in its folder and is not hidden.
-
-    Only such files are part of a folder's digest.
-    """
-    path = PurePosixPath(name)
-    return not path.is_absolute() and not any(part.startswith(".") for part in path.parts)
-
-
 def name_below_images(name: str) -> str:
     """Return the name of a listed image relative to ``images/``."""
     return PurePosixPath(name).as_posix().removeprefix("images/")
@@ -209,14 +198,6 @@ def listed_pictures(frames: Sequence[SourceFrame], source: Path, listing: str) -
     return (
         f"{line}; left out: {places.total()} others ({', '.join([*named[:4], *['...'][: len(named) - 4]])})"
     )
-
-
-def spread(items: Sequence[T], at_most: int) -> list[T]:
-    """Return at most ``at_most`` of ``items``, evenly by position, with the first and the last."""
-    if len(items) <= at_most:
-        return list(items)
-    step = (len(items) - 1) / max(1, at_most - 1)
-    return [items[round(index * step)] for index in range(at_most)]
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:

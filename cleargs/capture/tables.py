@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cleargs.capture.folders import is_inside
+from cleargs.digest import is_inside
 from cleargs.errors import StoreError
 from cleargs.parquet import column, read_table, schema_of
 

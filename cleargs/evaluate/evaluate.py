@@ -22,13 +22,13 @@ from cleargs.evaluate.references import Reference, matching
 from cleargs.files import disk_errors
 from cleargs.manifest import versions
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
-from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
 from cleargs.plugins import installed_version
 from cleargs.progress import Reporter
 from cleargs.splat.backend import decibels, set_threads
 from cleargs.splat.formats import read_scene
 from cleargs.splat.ply import READ
+from cleargs.torch_threads import one_thread
 from cleargs.types import ImageU8, MaskBool
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cleargs.capture.measuring import MOTION
+from cleargs.capture.motion_table import MOTION
 from cleargs.formation.motion import TWIST, FrameMotion
 from cleargs.formation.search import Measurement
 from cleargs.parquet import read_table

@@ -23,9 +23,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from cleargs.errors import InputError
-from cleargs.models.lpips import one_thread
 from cleargs.models.registry import find_model, model_dir, verify
 from cleargs.safe_io import FAULTS, faults_as, read_bytes
+from cleargs.torch_threads import one_thread
 from cleargs.types import ImageU8
 
 Kind = Literal["person", "animal", "vehicle", "screen"]

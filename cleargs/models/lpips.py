@@ -9,8 +9,7 @@ from __future__ import annotations
 import io
 import pickle
 import tarfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +22,7 @@ from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.safe_io import FAULTS, faults_as
+from cleargs.torch_threads import one_thread
 from cleargs.types import AnyArray, ImageF32
 
 Net = Literal["alex", "vgg"]
@@ -164,17 +164,6 @@ def _state_dict(net: Net, checkpoint: Mapping[str, Any], backbone: Mapping[str, 
     for index in range(len(network.heads)):
         state[f"heads.{index}.weight"] = _oihw(checkpoint[f"NetLinLayer_{index}"]["Conv_0"]["kernel"])
     return state
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread; with several, convolutions and reductions differ in the last bits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _planes(image: ImageF32) -> Tensor:

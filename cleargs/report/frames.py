@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from cleargs.capture.measuring import MOTION
+from cleargs.capture.motion_table import MOTION
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.table import FORMATION
 from cleargs.parquet import read_table

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import pyarrow as pa
 
-from cleargs.capture.folders import is_inside
+from cleargs.digest import is_inside
 from cleargs.errors import StoreError
 from cleargs.media.exr import Layer, read_exr
 from cleargs.parquet import read_table, schema_of, write_table

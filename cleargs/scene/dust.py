@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.capture.folders import spread
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.scene.measure import MAX_EVALUATED, ViewPsnr, evaluate_views
+from cleargs.sequences import spread
 from cleargs.splat.backend import mean_psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_C0

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.capture.folders import spread
 from cleargs.formation.deblur import deblur
 from cleargs.formation.estimate import Shot, Terms, fit_motion
 from cleargs.formation.formed import FormedView, render_formed
@@ -22,6 +21,7 @@ from cleargs.formation.shutter import rolls
 from cleargs.media.image import to_float32
 from cleargs.scene.folder import SceneFolder
 from cleargs.scene.measure import MAX_EVALUATED, evaluate_views, pooled_unseen
+from cleargs.sequences import spread
 from cleargs.splat.backend import backend_for, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig

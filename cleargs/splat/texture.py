@@ -22,6 +22,7 @@ from torch.nn import functional
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
 from cleargs.safe_io import FAULTS, faults_as
+from cleargs.torch_threads import one_thread
 
 WEIGHTS = Path(__file__).parents[1] / "models/weights/vgg16-layers.safetensors"
 """Kernels and biases of the three convolutions in float16, 0.2 MB."""
@@ -113,10 +114,6 @@ def _moments(maps: Tensor, window: int, scale: Tensor) -> tuple[Tensor, Tensor]:
 @contextmanager
 def _fixed_order() -> Iterator[None]:
     """Let torch add in the same order in every run, for any number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
-            yield
-    finally:
-        torch.set_num_threads(threads)
+    exact = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)
+    with one_thread(), exact:
+        yield

@@ -24,7 +24,7 @@ from cleargs.capture.cameras import Intrinsics, Pose, Similarity, normalise, pin
 from cleargs.capture.capture import SourceFrame
 from cleargs.capture.choice import held_out, holdout_hash, sharpness
 from cleargs.capture.database import apply_exif_focal
-from cleargs.capture.folders import frame_key, masks_of, natural_key, spread
+from cleargs.capture.folders import frame_key, masks_of, natural_key
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.layouts.video import _shares, choose_times
 from cleargs.capture.matching import loop_pairs, sequential_pairs
@@ -37,6 +37,7 @@ from cleargs.errors import InputError, StoreError
 from cleargs.media.image import read_rgb
 from cleargs.media.video import Timeline
 from cleargs.parquet import column, read_table, write_table
+from cleargs.sequences import spread
 from cleargs.stages.ingest import IngestConfig
 
 from .conftest import HEIGHT, WIDTH, texture

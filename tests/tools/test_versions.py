@@ -12,6 +12,7 @@ import pytest
 from cleargs.pipeline.stage import Stage
 from cleargs.pipeline.stages import Stages, installed
 from tools.versions import (
+    NO_RESULTS,
     Sources,
     current_lock,
     installed_sources,
@@ -37,7 +38,11 @@ def test_source_of_a_real_stage_has_its_imports() -> None:
     modules = sources.closure("cleargs.stages.rva")
     assert "cleargs.rva.config" in modules, "imported at the top"
     assert "cleargs.parquet" in modules, "imported inside run"
-    assert not any(name.startswith("cleargs.cli") for name in modules)
+    assert not any(f"{name}.".startswith(f"{other}.") for name in modules for other in NO_RESULTS)
+
+
+def test_modules_without_results_exist() -> None:
+    assert all(installed_sources().file(name) for name in NO_RESULTS)
 
 
 class PackageTree:

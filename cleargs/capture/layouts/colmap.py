@@ -17,7 +17,6 @@ from cleargs.capture.folders import (
     folders_to_search,
     frame_key,
     image_files,
-    is_inside,
     is_wanted,
     listed_pictures,
     mask_externals,
@@ -26,6 +25,7 @@ from cleargs.capture.folders import (
 from cleargs.capture.layouts import llff
 from cleargs.capture.layouts.llff import POSES_BOUNDS
 from cleargs.capture.model_text import image_lines
+from cleargs.digest import is_inside
 from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, open_regular
 
