@@ -18,19 +18,19 @@ from cleargs.splat.kernels.cuda.self_test import Sizes, View
 
 SMALL = Sizes(
     views={
-        "a small view": View(20, 18, 17, 3.0, all_outputs=True),
-        "a rolling shutter": View(25, 20, 16, 3.0, rolls=True),
-        "long tile lists": View(150, 16, 16, 6.0, faint=True),
-        "a large view": View(150, 40, 20, 2.0),
+        "a small view": View(10, 18, 17, 3.0, all_outputs=True),
+        "a rolling shutter": View(12, 20, 16, 3.0, rolls=True),
+        "long tile lists": View(130, 16, 16, 6.0, faint=True),
+        "a large view": View(40, 36, 18, 2.0),
     },
-    image=(6, 50),
+    image=(5, 16),
     refined=2000,
-    timed=View(20, 16, 16),
+    timed=View(6, 8, 8),
     repeats=4,
 )
 
-ONE_CHECK = SMALL._replace(views={}, refined=40)
-"""Without the rendering, which takes most of the time in the interpreter."""
+ONE_CHECK = SMALL._replace(views={}, image=(4, 8))
+"""The check of the loss comes first. Faults are planted there."""
 
 
 def hang(*given: object, **options: object) -> None:

@@ -101,12 +101,12 @@ def test_a_training_through_the_warp_follows_the_cpu(
     device: torch.device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A blurred, a rolled and a defocused frame, rendered with a margin."""
-    monkeypatch.setattr(splat_toy, "WIDTH", 20)
-    monkeypatch.setattr(splat_toy, "HEIGHT", 16)
+    monkeypatch.setattr(splat_toy, "WIDTH", 14)
+    monkeypatch.setattr(splat_toy, "HEIGHT", 10)
     # The motions are given: a search would decide near ties by the last bit.
     monkeypatch.setattr(capture, "fit_motion", lambda frame, *given, **options: frame)
     rng = np.random.default_rng(0)
-    views = splat_toy.views([rng.integers(0, 256, (16, 20, 3), dtype=np.uint8) for _ in range(3)])
+    views = splat_toy.views([rng.integers(0, 256, (10, 14, 3), dtype=np.uint8) for _ in range(3)])
     depth = {"median_depth": 1.0}
     motions = {
         "blur": FrameMotion(blur=0.3 * ALL.blur, **depth),

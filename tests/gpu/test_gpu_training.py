@@ -118,11 +118,11 @@ CONFIG = FastGrowth(
 
 @pytest.fixture
 def toy(monkeypatch):
-    """Return three views of random images of 20 x 15 px."""
-    monkeypatch.setattr(splat_toy, "WIDTH", 20)
-    monkeypatch.setattr(splat_toy, "HEIGHT", 15)
+    """Return three views of random images of 18 x 8 px, which have two tiles."""
+    monkeypatch.setattr(splat_toy, "WIDTH", 18)
+    monkeypatch.setattr(splat_toy, "HEIGHT", 8)
     rng = np.random.default_rng(0)
-    pictures = [rng.integers(0, 256, (15, 20, 3), dtype=np.uint8) for _ in range(3)]
+    pictures = [rng.integers(0, 256, (8, 18, 3), dtype=np.uint8) for _ in range(3)]
     return splat_toy.views(pictures, weights=[1.0, 0.5, 0.25])
 
 
@@ -146,7 +146,7 @@ def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_p
     assert learned.exposure.enabled
     rows = whole.rows.to_pydict()
     assert rows["step"] == [1, 2, 3, 4, 5]
-    assert rows["width"] == [10, 10, 20, 20, 20]
+    assert rows["width"] == [9, 9, 18, 18, 18]
     assert all(0.0 < loss < 1.0 for loss in rows["loss"])
     assert all(0.0 < value < 50.0 for value in rows["psnr"])
     # The checkpoint of step 3 is still there: resuming from it does steps 4 and 5 again.

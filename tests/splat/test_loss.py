@@ -41,7 +41,7 @@ def ssim_map(image, target):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("size", [(14, 50), (1, 1), (3, 46), (30, 2)])
+@pytest.mark.parametrize("size", [(12, 43), (1, 1), (3, 43), (13, 2)])
 def test_photometric_loss_equals_torch(size, masked, device):
     image, target, generator = images(*size, device)
     mask = (torch.rand(size, generator=generator) > 0.3).to(device) if masked else None
@@ -192,8 +192,8 @@ def test_the_regularisers_equal_autograd(device):
 
 
 def test_a_brighter_value_than_a_saturated_one_counts_as_equal(device):
-    image, target, generator = images(14, 50, device)
-    mask = (torch.rand(14, 50, generator=generator) > 0.3).to(device)
+    image, target, generator = images(6, 43, device)
+    mask = (torch.rand(6, 43, generator=generator) > 0.3).to(device)
     recorded, too_bright = clip_to_saturation(image, target, 0.7)
     assert 0.05 < too_bright.double().mean() < 0.5
     expected = photometric_loss(recorded, target, ssim_lambda=0.2, mask=mask)
