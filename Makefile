@@ -59,12 +59,14 @@ test-quick: .venv/test.stamp
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest
 
-# A separate environment in dist/, so that the tests use the wheel and not the checkout.
+# A separate environment in dist/, so that the tests use the wheel and not the checkout. Kernels whose sources are the
+# same are not compiled again.
 test-package: dist
 	rm -rf dist/env dist/try
 	$(PYTHON) -m venv dist/env
 	$(call install,dist/env,base,dist/*.tar.gz)
 	dist/env/bin/$(PIP_INSTALL) --no-deps --force-reinstall dist/*.whl
+	$(BIN)/python tests/reuse_kernels.py dist/env/bin/python
 	mkdir dist/try
 	cd dist/try && ../env/bin/python -P ../../tests/installed.py
 	cd dist/try && ../env/bin/cleargs synth capture --protocol mixed --frames 8 --size 240x136
