@@ -25,8 +25,9 @@ from cleargs.safe_io import FAULTS, read_json
 if TYPE_CHECKING:
     from cleargs.capture.colmap import pycolmap
 
-MAX_ASPECT, MIN_FOCAL, MAX_FOCAL = 1.1, 0.3, 5.0
-"""Largest ratio of fx and fy, and range of the focal length in long sides, of a lens that is believed."""
+MAX_ASPECT, MIN_FOCAL, MIN_FISHEYE, MAX_FOCAL = 1.1, 0.3, 0.13, 5.0
+"""Largest ratio of fx and fy, least focal length in long sides of a lens and of a fisheye, and largest one of
+both, that are believed. 0.13 is a circle of 250 degrees in a picture of 16:9."""
 
 WORLD = "world.json"
 """File of ingest with the similarity from its world to that of the input."""
@@ -122,6 +123,11 @@ class Intrinsics:
 
 def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
     return Intrinsics("PINHOLE", width, height, (fx, fy, cx, cy))
+
+
+def has_usual_focal(model: str, share: float) -> bool:
+    """Return True if a lens of ``model`` with a focal length of ``share`` long sides is believed."""
+    return (MIN_FISHEYE if MODELS[model].fisheye else MIN_FOCAL) <= share <= MAX_FOCAL
 
 
 def guessed_camera(model: str, width: int, height: int, share: float = COLMAPS_GUESS) -> Intrinsics:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cleargs.capture.cameras import MAX_ASPECT, MAX_FOCAL, MIN_FOCAL
+from cleargs.capture.cameras import MAX_ASPECT, has_usual_focal
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.model import SparseModel
 from cleargs.capture.prepare import WorkFrame
@@ -75,7 +75,8 @@ def report_lens(
     lenses = [model.cameras[key] for key in sorted(used)]
     ratios = [max(lens.focal) / min(lens.focal) for lens in lenses]
     shares = [sum(lens.focal) / 2 / max(lens.width, lens.height) for lens in lenses]
-    usual = config.focal is not None or MIN_FOCAL <= min(shares) <= max(shares) <= MAX_FOCAL
+    believed = all(has_usual_focal(lens.model, share) for lens, share in zip(lenses, shares, strict=True))
+    usual = config.focal is not None or believed
     if max(ratios) > MAX_ASPECT or not usual:
         lens = lenses[int(np.argmax(ratios))] if max(ratios) > MAX_ASPECT else lenses[0]
         fx, fy = lens.focal

@@ -9,6 +9,7 @@ it, and taken if they predict the kept-out tracks better.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,9 +17,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cleargs.capture.adjustment import Adjuster, lens_of, set_lens
+from cleargs.capture.adjustment import Adjuster, has_strange_aspect, lens_of, set_lens
 from cleargs.capture.camera_models import FIRST_LENS, FULL_LENS
-from cleargs.capture.cameras import MAX_ASPECT, MAX_FOCAL, MIN_FOCAL
+from cleargs.capture.cameras import has_usual_focal
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.motion import TWIST, projected
 from cleargs.capture.prediction import WITHIN_PX, prediction_errors
@@ -42,6 +43,8 @@ keypoints do not count."""
 ALIKE, AS_GOOD = 0.015, 1.02
 """Largest difference of the logarithms of neighbouring focal lengths of frames that share a lens; twice it is
 the largest in all of them. Frames share lenses if the error is at most this many times that with one each."""
+FAR_APART = 100.0
+"""Difference of logarithms that no two focal lengths have."""
 START_FOCALS = (0.25, 0.3, 0.36, 0.43, 0.52, 0.62, 0.75, 0.9, 1.2, 1.8, 3.0)
 """Focal lengths, in long sides, that a search tries."""
 FISHEYE_AHEAD = 1.03
@@ -137,10 +140,9 @@ def _prediction(errors: ArrayF64) -> Prediction:
 
 def is_impossible(camera: pycolmap.Camera) -> bool:
     """Return True if no usual lens has the focal lengths of ``camera``, and nobody stated them."""
-    fx, fy = camera.focal_length_x, camera.focal_length_y
     share = camera.mean_focal_length() / max(camera.width, camera.height)
     stated = camera.has_prior_focal_length
-    return max(fx, fy) > MAX_ASPECT * min(fx, fy) or not (stated or MIN_FOCAL <= share <= MAX_FOCAL)
+    return has_strange_aspect(camera) or not (stated or has_usual_focal(camera.model.name, share))
 
 
 def distortion(camera: pycolmap.Camera) -> float:
@@ -171,7 +173,7 @@ def fitted(sfm: Steps, model: pycolmap.Reconstruction, like: Adjuster | None = N
     own = _with_lenses(sfm, fit, list(range(len(sfm.job.names))), "own-cameras")
     if not own.model.points3D or not fit.is_beaten_by(own.model):
         return fit
-    owners = lens_owners(own.model, len(sfm.job.names))
+    owners = lens_owners(own.model, sfm.job.camera_of)
     if len(set(owners)) in (1, len(owners)):
         return own
     shared = _with_lenses(sfm, own, owners, "shared-cameras")
@@ -198,24 +200,29 @@ def _with_lenses(sfm: Steps, fit: Fit, owners: list[int], name: str) -> Fit:
     return Fit(changed, adjuster, changed)
 
 
-def lens_owners(model: pycolmap.Reconstruction, frames: int) -> list[int]:
+def lens_owners(model: pycolmap.Reconstruction, before: Sequence[int]) -> list[int]:
     """Return the number of the lens of each frame, by the focal lengths of ``model``, a camera per frame.
 
     Frames with focal lengths that are `ALIKE` share a lens: those before a change of lenses and after it, or
-    the photographs of one phone. Each frame of a zoom has its own.
+    the photographs of one phone. Each frame of a zoom has its own. Frames that had different cameras
+    ``before`` [F], as those of other sizes have, share none.
     """
     placed = sorted(key for key, image in model.images.items() if image.has_pose)
     focal = np.log([model.cameras[model.images[key].camera_id].mean_focal_length() for key in placed])
+    focal += FAR_APART * np.array([before[key - 1] for key in placed])
     order = np.argsort(focal, kind="stable")
     group = np.zeros(len(placed), np.int64)
     group[order] = np.cumsum(np.diff(focal[order], prepend=focal[order[0]]) > ALIKE)
     wide = [number for number in np.unique(group) if np.ptp(focal[group == number]) > 2 * ALIKE]
-    # A frame without a pose has the lens of the first frame.
-    names = dict.fromkeys(range(1, frames + 1), "")
-    for key, number in zip(placed, group.tolist(), strict=True):
-        names[key] = f"frame {key}" if number in wide else f"lens {number}"
-    for key in names:
-        names[key] = names[key] or names[placed[0]]
+    lens = {
+        key: f"frame {key}" if number in wide else f"lens {number}"
+        for key, number in zip(placed, group.tolist(), strict=True)
+    }
+    # A frame without a pose has the lens of the first frame that had its camera.
+    first = {before[key - 1]: lens[key] for key in reversed(placed)}
+    names = {
+        key: lens.get(key) or first.get(camera, f"camera {camera}") for key, camera in enumerate(before, 1)
+    }
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names.values()))}
     return [numbers[name] for name in names.values()]
 

@@ -41,6 +41,7 @@ from cleargs.capture.sfm_job import (
     NO_DEPTH,
     OUTCOME,
     OWN,
+    STRANGE_SHARE,
     Job,
     SfmOutcome,
 )
@@ -61,7 +62,10 @@ LEAST_ELSEWHERE = 0.15
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
 
-_DOUBT = "state the lens (ingest.focal, ingest.camera_model), or record slower, with more light and texture"
+_DOUBT = (
+    "state the lens (ingest.focal, ingest.camera_model), mask what moves by itself (masks/), "
+    "or record slower, with more light and texture"
+)
 
 _ADVICE = (
     "record more frames (ingest.fps, ingest.max_frames) with slower motion, "
@@ -224,10 +228,12 @@ def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -
     if found.share < LEAST_SHARE and outcome.method == "sfm":
         raise StageError(f"the cameras are wrong: {figure}", hint=doubt)
     kept = outcome.method == "given" and (outcome.missed_px or 0.0) <= config.refine_above
+    least = STRANGE_SHARE if outcome.strange_lens else GOOD_SHARE
     if found.share < GOOD_SHARE and kept:
         reporter.warn(f"the poses of the input are doubtful: {figure}; ingest.refine_above keeps them")
-    elif found.share < GOOD_SHARE:
-        return (f"cameras that the images confirm: {figure}, fewer than {GOOD_SHARE:.0%}; {doubt}",)
+    elif found.share < least:
+        strange = ", and they ask for a lens that nobody builds" if outcome.strange_lens else ""
+        return (f"cameras that the images confirm: {figure}, fewer than {least:.0%}{strange}; {doubt}",)
     else:
         reporter.info(f"cameras: {figure}")
     return ()

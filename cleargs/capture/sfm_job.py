@@ -27,9 +27,9 @@ OUTCOME = "outcome.json"
 """File in the folder of a model, with its `SfmOutcome`."""
 
 
-GOOD_SHARE, LEAST_SHARE, MIN_KEYPOINTS = 0.5, 0.25, 100
-"""Shares of the kept-out keypoints within 2 px below which ingest is done only in part, and fails; fewest
-keypoints that count."""
+GOOD_SHARE, LEAST_SHARE, STRANGE_SHARE, MIN_KEYPOINTS = 0.5, 0.25, 0.8, 100
+"""Shares of the kept-out keypoints within 2 px below which ingest is done only in part, fails, and is done
+only in part if the matches ask for a lens that is not believed; fewest keypoints that count."""
 
 
 class Job(FrozenModel):
@@ -85,6 +85,8 @@ class SfmOutcome(FrozenModel):
     """COLMAP model of the cameras that were adjusted; empty if no camera was adjusted."""
     focal_open: bool = False
     """True if the cameras look the same way, and their focal length is assumed (`capture.unturned`)."""
+    strange_lens: bool = False
+    """True if SfM found, or the matches ask for, a lens that is not believed (`lenses.is_impossible`)."""
     little_depth: bool = False
     """True if few pairs of frames show depth (`parallax.LITTLE_BELOW`)."""
     shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)

@@ -27,7 +27,7 @@ from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import colmap_cameras, copy_features, create_database, set_cameras
 from cleargs.capture.kept_out import all_tracks, epipolar_errors, verified_matches, weakest_join
-from cleargs.capture.lenses import FISHEYE_AHEAD, GAIN, Fit, fitted, searched
+from cleargs.capture.lenses import FISHEYE_AHEAD, GAIN, Fit, fitted, is_impossible, searched
 from cleargs.capture.mapping import Mapper, names_in
 from cleargs.capture.parallax import LITTLE_BELOW, NO_DEPTH_BELOW, depth_share
 from cleargs.capture.prediction import scales_differ
@@ -150,6 +150,8 @@ class Sfm(Mapper):
             torn_at=join - 1 if torn else None,
             elsewhere=sorted(tried.elsewhere - names_in(model)),
             focal_open=focal_open,
+            strange_lens=fit.adjuster.asks_for_strange_lens
+            or any(map(is_impossible, model.cameras.values())),
             little_depth=deep <= LITTLE_BELOW,
             shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
             prediction=figure,

@@ -40,10 +40,11 @@ def outcome_lines(outcomes: Sequence[StageOutcome], run: Path, report: Path | No
     last = outcomes[-1].manifest
     summaries = {outcome.stage: outcome.manifest.summary for outcome in outcomes}
     scene = SCENE in last.files
+    doubted = any(outcome.stage == "ingest" and outcome.manifest.missing for outcome in outcomes)
     partial = ", in part" if last.status == "partial" else ""
     place = run / (SCENE if scene else last.stage)
     lines = [
-        f"{'scene' if scene else 'results'}: {place}{partial}{_extent(summaries)}",
+        f"{'scene' if scene else 'results'}: {place}{partial}{_extent(summaries, doubted)}",
         f"quality: {_quality(summaries)}",
         f"time: {_times(outcomes)}",
         as_called(f"next: {_next(summaries, run, scene)}"),
@@ -52,8 +53,11 @@ def outcome_lines(outcomes: Sequence[StageOutcome], run: Path, report: Path | No
     return [line for line in lines if not line.endswith(": ")]
 
 
-def _trust(kept_out: Mapping[str, Any] | None) -> str:
-    """Return if frames count as placed, with the figure of the keypoints that took no part in their fit."""
+def _trust(kept_out: Mapping[str, Any] | None, doubted: bool) -> str:
+    """Return if frames count as placed, with the figure of the keypoints that took no part in their fit.
+
+    ``doubted``: ingest says that the images contradict the cameras.
+    """
     if kept_out is None:
         return "placed"
     figure = (
@@ -61,15 +65,17 @@ def _trust(kept_out: Mapping[str, Any] | None) -> str:
     )
     from cleargs.capture.sfm_job import GOOD_SHARE
 
-    return f"{'placed' if kept_out['share'] >= GOOD_SHARE else 'with doubtful cameras'}: {figure}"
+    doubted |= kept_out["share"] < GOOD_SHARE
+    return f"{'with doubtful cameras' if doubted else 'placed'}: {figure}"
 
 
-def _extent(summaries: Summaries) -> str:
+def _extent(summaries: Summaries, doubted: bool) -> str:
     """Return the numbers of placed, reliable and repaired frames, as far as they are known."""
     ingest, consolidate = summaries.get("ingest", {}), summaries.get("consolidate", {})
     words = []
     if "registered" in ingest and "frames" in ingest:
-        words.append(f"{ingest['registered']} of {ingest['frames']} frames {_trust(ingest.get('kept_out'))}")
+        trust = _trust(ingest.get("kept_out"), doubted)
+        words.append(f"{ingest['registered']} of {ingest['frames']} frames {trust}")
     if "roles" in summaries.get("rva", {}):
         words.append(f"{summaries['rva']['roles']['strong']} reliable")
     if consolidate.get("repairs"):

@@ -133,7 +133,7 @@ def test_wrong_matches_do_not_hide_a_better_lens(tmp_path: Path) -> None:
 
 
 def test_frames_whose_focal_lengths_are_alike_share_a_lens() -> None:
-    def owners(focal: list[float]) -> list[int]:
+    def owners(focal: list[float], before: list[int] | None = None) -> list[int]:
         options = pycolmap.SyntheticDatasetOptions(num_rigs=len(focal), num_cameras_per_rig=1)
         options.num_frames_per_rig, options.num_points3D = 1, 10
         model = pycolmap.synthesize_dataset(options)
@@ -143,11 +143,12 @@ def test_frames_whose_focal_lengths_are_alike_share_a_lens() -> None:
                 pycolmap.CameraModelId.SIMPLE_RADIAL,
                 [focal[image.image_id - 1], 0, 0, 0],
             )
-        return lens_owners(model, len(focal))
+        return lens_owners(model, before or [0] * len(focal))
 
     assert owners([300, 301, 299, 540, 541, 300]) == [0, 0, 0, 1, 1, 0]
     assert owners([300, 320, 342, 365]) == [0, 1, 2, 3]
     assert owners([300, 301, 300, 330, 360, 361]) == [0, 0, 0, 1, 2, 2]
+    assert owners([300, 301, 300, 540], [0, 1, 0, 1]) == [0, 1, 0, 2]  # pictures of two sizes
     breath = [300 * (1 + 0.0155 * float(np.sin(number))) for number in range(24)]
     assert len(set(owners(breath))) in (1, 24)
 
@@ -177,19 +178,29 @@ def test_lenses_that_nobody_builds_are_impossible() -> None:
 
     assert not is_impossible(lens(250, 260))
     assert all(map(is_impossible, (lens(173, 250), lens(31, 31), lens(4161, 4161))))
+    params = [75, 75, 160, 120, 0, 0, 0, 0]  # a circle of 183 degrees
+    circle = pycolmap.Camera(model="OPENCV_FISHEYE", width=320, height=240, params=params)
+    assert not is_impossible(circle) and is_impossible(lens(75, 75))
     stated = lens(4161, 4161)
     stated.has_prior_focal_length = True
     assert not is_impossible(stated)
 
 
 def test_the_figure_decides_between_placed_in_part_and_failed() -> None:
-    def said(share: float, keypoints: int = 1000) -> tuple[str, ...]:
+    def said(share: float, keypoints: int = 1000, **facts: Any) -> tuple[str, ...]:
         found = Prediction(keypoints=keypoints, share=share, median_px=1.0)
-        return contradictions(SfmOutcome(prediction=found, method="sfm"), SfmConfig(), SilentReporter())
+        outcome = SfmOutcome(prediction=found, method="sfm", **facts)
+        return contradictions(outcome, SfmConfig(), SilentReporter())
 
     assert said(0.9) == () == said(0.1, keypoints=20)
     assert contradictions(SfmOutcome(), SfmConfig(), SilentReporter()) == ()
     assert "only" not in said(0.4)[0] and "40% are within 2 px" in said(0.4)[0]
+    # A walk before a wall of text that scrolls: 65 %, fx and fy differ by 30 %, centres are off by 42 %.
+    assert (
+        "nobody builds" in said(0.65, strange_lens=True)[0]
+        and "moves by itself" in said(0.65, strange_lens=True)[0]
+    )
+    assert said(0.65) == () == said(0.9, strange_lens=True)
     with pytest.raises(StageError, match="the cameras are wrong"):
         said(0.2)
 
