@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from cleargs.capture.adjustment import Adjuster, lens_of, set_lens
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.kept_out import all_tracks
@@ -184,6 +185,38 @@ def test_lenses_that_nobody_builds_are_impossible() -> None:
     stated = lens(4161, 4161)
     stated.has_prior_focal_length = True
     assert not is_impossible(stated)
+
+
+class FixedAdjuster(Adjuster):
+    """Finds the focal length ``fy``, which leaves the share ``left`` of the error."""
+
+    def __init__(self, fy: float, left: float) -> None:
+        self.fy, self.left, self.asks_for_strange_lens = fy, left, False
+
+    def bundle_adjusted(self, model: pycolmap.Reconstruction, *, cameras: bool) -> pycolmap.Reconstruction:
+        for camera in model.cameras.values():
+            camera.params = [camera.params[0], self.fy * camera.params[0], *camera.params[2:]]
+        return model
+
+    def mean_error(self, model: pycolmap.Reconstruction) -> float:
+        return self.left if lens_of(model) == "OPENCV" else 1.0
+
+
+def test_two_focal_lengths_that_no_lens_has_must_halve_the_error() -> None:
+    """On a turntable, which turns about one axis only, fx and fy of 207 and 925 px left 74 %."""
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=4)
+    options.num_points3D = 50
+    model = pycolmap.synthesize_dataset(options)
+    set_lens(model, "SIMPLE_RADIAL")
+
+    def chosen(fy: float, left: float) -> tuple[str, bool]:
+        adjuster = FixedAdjuster(fy, left)
+        return lens_of(adjuster._with_measured_lens(model)), adjuster.asks_for_strange_lens
+
+    assert chosen(4.5, 0.74) == ("SIMPLE_RADIAL", True)
+    assert chosen(1.02, 0.74) == ("OPENCV", False)
+    assert chosen(1.33, 0.2) == ("OPENCV", True)  # stretched pictures
+    assert chosen(4.5, 0.99) == ("SIMPLE_RADIAL", False)
 
 
 def test_the_figure_decides_between_placed_in_part_and_failed() -> None:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -463,6 +464,11 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path) -> None:
         f"next: cleargs export '{run}' -o 'my room.sog'",
         f"report: file://{tmp_path}/my%20room/report.html",
     ]
+    figure = {"share": 0.65, "median_px": 0.9}
+    found = outcome("ingest", "made", [], frames=24, registered=22, kept_out=figure)
+    assert "22 of 24 frames placed: 65%" in outcome_lines([found], run)[0]
+    found = replace(found, manifest=found.manifest.model_copy(update={"missing": ("cameras",)}))
+    assert "22 of 24 frames with doubtful cameras: 65%" in outcome_lines([found], run)[0]
     of_stage = outcome_lines(outcomes[-1:], run)  # as `cleargs stage` does
     assert len(of_stage) == 4 and of_stage[1].startswith("quality: PSNR 23.6 dB on pixels")
 
