@@ -259,8 +259,8 @@ def summary_table(listed: RealList, found: RealResults) -> str:
         origins.setdefault(without_digest(_origins(shown)), []).append(scene.name)
     made = ". ".join(f"{', '.join(names)}: {origin}" for origin, names in origins.items())
     line = (
-        "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians. Where the video "
-        "tells the camera's motion, the scene of ClearGS is compared as the camera took the frames. ± is "
+        "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians. If the motion of the "
+        "camera was measured, the scene of ClearGS is compared as the camera took the frames. ± is "
         f"half the 95 % interval of the difference over the trainings; bold excludes zero. {made}."
     )
     if absent:
