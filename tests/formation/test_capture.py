@@ -19,7 +19,7 @@ from cleargs.formation.exposure import Exposure
 from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.movement import static_pixels
+from cleargs.formation.movement import CELLS, static_pixels
 from cleargs.formation.pretest import MissingBlur
 from cleargs.formation.search import search
 from cleargs.formation.shutter import MIN_TESTED_FRAMES, CameraSpeeds
@@ -397,8 +397,8 @@ def test_what_moves_teaches_little(tmp_path: Path) -> None:
 
 
 def test_a_repair_does_not_teach_where_its_frame_moves() -> None:
-    cells = np.zeros((21, 32), np.bool_)
-    cells[5:9, 10:15] = True
+    cells = np.zeros((round(CELLS * HEIGHT / WIDTH), CELLS), np.bool_)
+    cells[10:18, 20:30] = True
     formation = CaptureFormation(views(), FormationConfig(start=1.0), moving={1: cells})
     target, mask = torch.zeros(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, :5] = False
