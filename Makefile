@@ -3,6 +3,7 @@
 # make test              run all tests that are not slow, apart from those of benchmarks/
 # make test-quick        run those of files that take less than three seconds of a processor each
 # make test-all          run all tests
+# make coverage          run the tests of `make test`, and name the lines of the program that they do not run
 # make test-package      build wheel and sdist, install them separately, and run the smoke demo from the wheel
 # make drill             kill every stage and gc 50 times, plant 1,000 links in runs, and compare
 # make fuzz              read 2,000 mutations of each kind of file; SEED=N selects others
@@ -36,7 +37,7 @@ define install
 endef
 PINS := pyproject.toml requirements.lock constraints.txt
 
-.PHONY: demo env test test-quick test-all test-package drill fuzz findings test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
+.PHONY: demo env test test-quick test-all coverage test-package drill fuzz findings test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
 
 env: .venv/demo.stamp
 	@echo "ClearGS is installed in $(CURDIR)/.venv. Next, in the folder of your video:"
@@ -58,6 +59,14 @@ test-quick: .venv/test.stamp
 
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest
+
+# Which lines of the program `make test` runs; measured once per release, for docs/testing.md.
+coverage: .venv/dev.stamp
+	$(BIN)/python tests/warm_kernels.py
+	$(BIN)/python -m coverage erase
+	$(BIN)/python -m coverage run -m pytest -m 'not slow and not benchmarks' $(PARALLEL)
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage report --skip-covered --sort=cover
 
 # A separate environment in dist/, so that the tests use the wheel and not the checkout. Kernels whose sources are the
 # same are not compiled again.
