@@ -60,7 +60,7 @@ test-quick: .venv/test.stamp
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest
 
-# Which lines of the program `make test` runs; measured once per release, for docs/testing.md.
+# Name the lines of the program that `make test` does not run: measured once per release, for docs/testing.md.
 coverage: .venv/dev.stamp
 	$(BIN)/python tests/warm_kernels.py
 	$(BIN)/python -m coverage erase
