@@ -9,7 +9,7 @@ Each frame has a grid of cells. A cell moves if all of the following are true:
 - At least three other frames see the same place of the scene, and the median of their differences there is
   below a fifth of the cell's difference. Content that most frames show at a place does not move.
 - The place moves in at most half of the eight nearest frames that see it.
-- It belongs to a region of at least eight cells.
+- It belongs to a region of at least sixteen cells.
 
 In the box of a person, an animal, a vehicle or a screen, half of the difference suffices, the other frames
 may have twice the share of it, and a region may have any size.
@@ -35,7 +35,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.types import Render
 from cleargs.types import ArrayF32, ArrayF64, MaskBool
 
-TOLERANCE = 0.08
+TOLERANCE = 0.1
 """Difference of mean colours, sRGB in [0, 1], up to which nothing moves."""
 HIDING = 0.3
 """RVA's ghosting cue of a frame from which the training looks for movement (docs/movement.md)."""
@@ -51,7 +51,7 @@ NEAR_FRAMES, MAX_NEAR_SHARE = 8, 0.5
 """Number of nearest frames, by camera, that see a place, and the largest share of them in which it may move.
 If it moves in more, something that does not move was masked by mistake. It was then not learned, so it
 differs from the render."""
-MIN_CELLS = 8
+MIN_CELLS = 16
 """Fewest cells of a region that moves."""
 LIKELY = 2.0
 """Factor by which evidence may be weaker in the box of something that may move; its regions may be small."""

@@ -148,9 +148,9 @@ def test_a_small_spot_is_not_a_region() -> None:
     cells = np.zeros((18, 32), np.bool_)
     cells[4:6, 4:6] = True
     assert not regions(cells).any()
-    cells[10:13, 10:13] = True
+    cells[10:14, 10:14] = True
     found = regions(cells)
-    assert found[9:14, 9:14].all() and found.sum() == 25
+    assert found[9:15, 9:15].all() and found.sum() == 36
 
 
 def test_state_and_table_return_the_same(tmp_path: Path) -> None:
