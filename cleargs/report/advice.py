@@ -142,11 +142,11 @@ def _on_frames(
     config: Config, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]
 ) -> Iterator[Advice]:
     ingest: Any = config.sections["ingest"]
-    g0: Any = config.sections["g0"]
+    g0: Any = config.sections.get("g0")  # a pipeline of other stages may have none
     unplaced = sum(row.role == UNPLACED for row in rows)
     available = IngestSummary.of(manifests.get("ingest")).frames_available or 0
     more: dict[str, Any] = {}  # the setting that limits the number of frames, if the capture has more
-    if available > len(rows) and g0.quality != "draft":
+    if available > len(rows) and not (g0 and g0.quality == "draft"):
         if ingest.fps is not None and len(rows) < ingest.max_frames:
             more = {"ingest.fps": 2 * ingest.fps}
         else:
