@@ -61,9 +61,11 @@ def without_dust(
 ) -> Dusted:
     """Remove the `DUST` of a training, with its moments of Adam, and draw in what is `FAR` outside.
 
-    Each of both happens only if the frames lose at most `MAX_LOSS`.
+    Each of both happens only if there are frames, and they lose at most `MAX_LOSS`.
     """
     real = [view for view in views if view.kind == "real"]
+    if not real:
+        return Dusted(trained, 0, 0, [], [])
     few, scene = spread(real, MAX_EVALUATED), trained.scene.to(device)
 
     def fits_of(changed: Scene) -> list[ViewPsnr]:

@@ -110,3 +110,12 @@ def test_it_is_drawn_in_if_the_frames_lose_nothing(cameras: int) -> None:
     last = float(done.trained.scene.gaussians.means[-1, 2])
     assert done.dropped == 0 and done.drawn_in == (cameras == 1)
     assert last < 3.0 if cameras == 1 else last == 40.0
+
+
+def test_without_a_frame_nothing_changes() -> None:
+    """No frame says what may go: the mean of no cameras is not a number."""
+    truth = splat_toy.gaussians()
+    far = replace(truth.select(torch.arange(1)), means=torch.tensor([[0.0, 90.0, 0.0]]))
+    repaired = [replace(view, kind="pseudo") for view in splat_toy.views(splat_toy.images(truth, 2))]
+    done = without_dust(trained(together(far, truth)), repaired, None, {}, {}, "cpu")
+    assert torch.equal(done.trained.scene.gaussians.means, together(far, truth).means)
