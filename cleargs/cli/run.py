@@ -306,12 +306,15 @@ def status(dag: Stages, run: Path, store: Path | None, as_json: bool) -> None:
     plans = _with_outdated(plans, settings.folder, dag)
     if at_work := stage_at_work(settings.folder, settings.store):
         name, text = at_work
-        words = (text.removeprefix("running: "),)
-        for place, plan in enumerate(plans):
-            if plan.stage == name and words == (text,):
-                plans[place] = replace(plan, reasons=words)
-            elif plan.stage == name:
-                plans[place] = replace(plan, state="running", reasons=words)
+        working = text.startswith("running: ")
+        plans = [
+            replace(
+                plan, state="running" if working else plan.state, reasons=(text.removeprefix("running: "),)
+            )
+            if plan.stage == name
+            else plan
+            for plan in plans
+        ]
     print_plans(plans, as_json, settings.stages(dag))
 
 
