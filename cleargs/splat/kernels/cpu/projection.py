@@ -42,6 +42,8 @@ LOG2_ALPHA_CUT = constants.LOG2_ALPHA_CUT
 SH_OFFSET = np.float32(constants.SH_OFFSET)
 HALF_LOG2E = 0.5 / math.log(2.0)
 TWO_LN2 = 2.0 * math.log(2.0)
+WIDEST = -TWO_LN2 * LOG2_ALPHA_CUT * 1.01
+"""Square of the distance, in standard deviations, at which an opaque splat ends, and a margin."""
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 BLOCK = 128
 """Gaussians per work item; fixed, so that nothing depends on the number of threads."""
@@ -179,24 +181,43 @@ def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple
 
 
 @device
+def beside(mean: float, size: int, row: Vector, largest: float) -> bool:
+    """Return True if an opaque sphere with the ``largest`` scale would touch no pixel; False for NaN.
+
+    The other numbers of a Gaussian, above all its SH, are not read then. In a room, half of them are beside
+    the image.
+    """
+    extent = math.sqrt(WIDEST * (dot(row, row) * largest * largest + DILATION)) + 1.0
+    return mean + extent < 0.0 or mean - extent > size + layout.TILE  # tiles may end beyond the image
+
+
+@device
 def project_one(
     g: int,
     parameters: Parameters,
     sh_count: int,
     view: ProjectionView,
     antialias: bool,
+    size: tuple[int, int],  # width and height, px
     splats: ArrayF32,
     basis: ArrayF32,
 ) -> bool:
-    """Write the packed splat of Gaussian ``g``. Return False if it is behind, too faint or not finite."""
+    """Write the packed splat of Gaussian ``g``.
+
+    Return False if it is behind, beside the image, too faint or not finite.
+    """
     means, log_scales, rotations, logits, sh = parameters
     x, y, z = camera_position(means[g], view)
     if not NEAR <= z <= FLOAT32_MAX:  # also if z is NaN
         return False
+    row0, row1 = projection_rows(x, y, z, view)
+    mean_x, mean_y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    largest = math.exp(max(log_scales[g, 0], log_scales[g, 1], log_scales[g, 2]))
+    if beside(mean_x, size[0], row0, largest) or beside(mean_y, size[1], row1, largest):
+        return False
     qw, qx, qy, qz, _ = unit_quaternion(rotations[g])
     sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])
     axis0, axis1, axis2 = scaled_axes(qw, qx, qy, qz, sx, sy, sz)
-    row0, row1 = projection_rows(x, y, z, view)
     u0 = (dot(row0, axis0), dot(row0, axis1), dot(row0, axis2))
     u1 = (dot(row1, axis0), dot(row1, axis1), dot(row1, axis2))
     xx, xy, yy = dot(u0, u0) + DILATION, dot(u0, u1), dot(u1, u1) + DILATION
@@ -207,7 +228,6 @@ def project_one(
     if antialias:
         normal = cross(w, u1)
         log2_opacity += 0.5 * math.log2(dot(normal, normal) / (variance * yy))
-    mean_x, mean_y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
     reach = TWO_LN2 * (log2_opacity - LOG2_ALPHA_CUT)
     if not (reach >= 0.0 and is_finite(variance) and is_finite(xx) and is_finite(yy)):
         return False
@@ -263,7 +283,8 @@ def project(
         basis = np.empty(16, np.float32)
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             tiles = 0
-            if project_one(g, parameters, sh_count, own_view(g, view, poses), antialias, splats, basis):
+            own = own_view(g, view, poses)
+            if project_one(g, parameters, sh_count, own, antialias, (width, height), splats, basis):
                 tiles = count_tiles(splats[g], width, height)
                 if len(poses) > 0:  # different poses would mix the order of Gaussians on one surface
                     splats[g, layout.DEPTH] = max(camera_position(parameters[0][g], view)[2], NEAR)
