@@ -20,7 +20,7 @@ from cleargs.scene.folder import SceneFolder
 from cleargs.scene.training import train_into
 from cleargs.scene.viewer import SceneViewer, observed_image
 from cleargs.splat.backend import psnr
-from cleargs.splat.config import TrainConfig
+from cleargs.splat.config import OFF, TrainConfig
 from cleargs.splat.views import TrainingView
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -73,6 +73,7 @@ def distil(
             label=label,
             device=start.device,
             round=round,
+            dust=config.densify != OFF,  # without new Gaussians there is hardly any since the first training
             seed=seed,
             moments=start.files.moments(start.scene.gaussians),
             pseudo_share=even if pseudo_share == "even" else pseudo_share * repaired,

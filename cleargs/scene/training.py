@@ -32,14 +32,17 @@ def train_into(
     label: str,
     device: str,
     round: int = 0,
+    dust: bool = True,  # remove the dust of the scene
     **options: Any,  # for `Trainer`
 ) -> Dusted:
     """Train a scene, remove its dust and write the files of `SceneFolder` into ``folder``."""
     trainer = Trainer(scene, views, config, formation=formation, device=device, **options)
     trained = run(trainer, checkpoint=checkpoint, reporter=reporter, label=label, round=round)
     learned = formation.exposure or exposure
-    with timed("removing dust"):
-        dusted = without_dust(trained, views, learned, formation.frames, formation.moving, device)
+    dusted = Dusted(trained, 0, 0, [], [])
+    if dust:
+        with timed("removing dust"):
+            dusted = without_dust(trained, views, learned, formation.frames, formation.moving, device)
     weights = {view.frame_id: view.weight for view in views if view.kind == "real"}
     with timed("writing the scene"):
         SceneFolder(folder).write(dusted.trained, learned, formation, weights)

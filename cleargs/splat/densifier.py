@@ -6,6 +6,7 @@ setting ``g0.densify`` names it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 ERROR_STEPS = 5
 """Number of steps before a refinement that measure its errors, one frame each. Each costs a backward pass, so
 at most an eighth of the steps between refinements measure errors."""
+
+NOISE_EVERY = 4
+"""Number of steps from one noise on the means to the next, which has the variance of so many."""
 
 
 @dataclass
@@ -68,7 +72,7 @@ class Densifier(Protocol):
 
 
 class MCMC:
-    """The strategy of `cleargs.splat.densification`: refinements at even intervals, noise after each step."""
+    """The strategy of `cleargs.splat.densification`: refinements at even intervals, noise in between."""
 
     def __init__(self, config: TrainConfig) -> None:
         self._config = config
@@ -98,10 +102,10 @@ class MCMC:
                     seed=(*state.seed, Stream.REFINEMENT, state.step),
                 )
                 state.errors = None
-        if config.noise > 0.0:
+        if config.noise > 0.0 and state.step % NOISE_EVERY == 0:
             backend.add_position_noise(
                 state.gaussians,
-                amount=config.noise * state.rate_of_means,
+                amount=math.sqrt(NOISE_EVERY) * config.noise * state.rate_of_means,
                 min_opacity=config.min_opacity,
                 seed=(*state.seed, Stream.POSITION_NOISE, state.step),
             )
