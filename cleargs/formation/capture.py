@@ -11,7 +11,7 @@ refines the motion with the current scene. All models are searched from scratch 
 
 `pretest` cannot see a skew: while a rolling shutter is possible, frames are searched for it. Later trainings
 continue with formations and numbers of estimates. They keep the formation of a frame after
-`ESTIMATES_TO_KEEP` estimates, unless the shutter rolls.
+`ESTIMATES_TO_KEEP` estimates.
 """
 
 from __future__ import annotations
@@ -108,8 +108,6 @@ class CaptureFormation:
         judged = sum(frame_id in self._measured for frame_id in real)
         self._readout_found = any(path.rolls for path in self._measured.values())
         self._shutter_measured = judged >= max(MIN_TIMED_FRAMES, MEASURED_SHARE * len(real))
-        if self._rolls():  # a training begins with a search of each frame
-            self._frames = {k: replace(frame, steps=0) for k, frame in self._frames.items()}
         enough = (ESTIMATES_TO_KEEP - 1) * config.every
         self._kept = {frame_id for frame_id, frame in self._frames.items() if frame.steps > enough}
         self._tested = {real[k] for k in frames_to_test(len(real))}

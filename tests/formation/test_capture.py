@@ -338,10 +338,8 @@ def test_a_later_training_keeps_what_was_looked_at_often(
     np.testing.assert_array_equal(formation.frames[BLURRED].motion.vector, BLUR.vector)
 
 
-def test_frames_of_a_rolling_shutter_are_looked_at_in_every_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing was measured that would let a later training keep their formations."""
+def test_frames_of_a_rolling_shutter_are_kept_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search in a short later training would put a worse motion in place of theirs."""
     looked: list[int] = []
 
     def look(frame: FrameFormation, *_: Any, **__: Any) -> FrameFormation:
@@ -352,7 +350,7 @@ def test_frames_of_a_rolling_shutter_are_looked_at_in_every_training(
     steps = ESTIMATES_TO_KEEP * LOOK.every
     rolling = {k: FrameFormation(k, BLUR, "blur", skew_gain=0.2, steps=steps) for k in range(FRAMES)}
     run(tmp_path, views(), CaptureFormation(views(), LOOK, known=rolling))
-    assert min(looked.count(k) for k in range(FRAMES)) >= CONFIG.steps // FRAMES // LOOK.every
+    assert not looked
 
 
 def test_the_next_training_counts_on_and_does_not_search(tmp_path: Path, searched: list[FramePair]) -> None:
