@@ -27,7 +27,7 @@ class CaptureConfig(FrozenModel):
         "alone decides",
     )
     max_frames: int = Field(
-        150,
+        240,
         ge=3,
         description="most frames to take, evenly; in a video, the sharpest nearby, and evenly by the motion "
         "of the picture if the pace is uneven and fps is unset",

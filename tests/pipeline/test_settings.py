@@ -124,9 +124,9 @@ def test_run_file_has_the_meaning_of_each_setting(bench: Bench) -> None:
     text = (bench.folder / "run.toml").read_text()
     comment = (
         "# most frames to take, evenly; in a video, the sharpest nearby, and evenly by the motion of the "
-        "picture if the\n# pace is uneven and fps is unset (a whole number, at least 3; default 150)"
+        "picture if the\n# pace is uneven and fps is unset (a whole number, at least 3; default 240)"
     )
-    assert f"{comment}\nmax_frames = 150\n" in text
+    assert f"{comment}\nmax_frames = 240\n" in text
     assert 'holdout = "every:8"' in text
     assert "default unset)\n# fps =\n" in text, "a setting without a value is there too"
     assert read_run_file(bench.folder, installed()).config == document

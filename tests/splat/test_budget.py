@@ -18,10 +18,10 @@ from cleargs.stages.config import DistilConfig
 
 
 def test_steps_follow_the_frames_within_bounds() -> None:
-    found = [steps_from_frames(frames) for frames in (1, 60, 100, 120, 1000)]
+    found = [steps_from_frames(frames) for frames in (1, 60, 300, 320, 1000)]
     assert found == sorted(found) and found[0] == found[1] < found[2] < found[3] < found[4]
     assert steps_from_frames(1000) == steps_from_frames(10_000)
-    for frames in (16, 100):
+    for frames in (16, 300):
         draft, standard, high = (steps_from_frames(frames, quality) for quality in get_args(Quality))
         assert draft == round(standard / 3) and 6 * standard == high
 
@@ -74,7 +74,7 @@ def test_estimated_growth_equals_the_log() -> None:
 def test_high_quality_grows_to_twice_the_gaussians_of_standard() -> None:
     """Without a budget that ends the growth before."""
     standard, high = (
-        TrainConfig(steps=steps_from_frames(100, quality), budget=20_000_000, quality=quality)
+        TrainConfig(steps=steps_from_frames(300, quality), budget=20_000_000, quality=quality)
         for quality in ("standard", "high")
     )
     # The refinements are as many; growth by 6.5 % in place of 5 % gives 1.97 times the Gaussians.
