@@ -41,6 +41,8 @@ from cleargs.capture.sfm_job import (
     NO_DEPTH,
     OUTCOME,
     OWN,
+    SECOND_MOTION,
+    STILL_SHARE,
     STRANGE_SHARE,
     Job,
     SfmOutcome,
@@ -224,16 +226,24 @@ def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -
         f"of {found.keypoints} keypoints that took no part in the fit, {found.share:.0%} are within 2 px of "
         f"their places (median {found.median_px:.2g} px)"
     )
-    doubt = _advice(outcome, _DOUBT)
+    least, doubt = GOOD_SHARE, _advice(outcome, _DOUBT)
+    why = ""
+    if outcome.strange_lens:
+        least, why = STRANGE_SHARE, ", and they ask for a lens that nobody builds"
+    if outcome.second_motion >= SECOND_MOTION:
+        least, doubt = STILL_SHARE, "mask what moves (masks/), or use more frames (ingest.max_frames)"
+        why = (
+            f"; in {outcome.second_motion:.0%} of the pairs of frames, many matches agree with each other, "
+            "but not with the cameras: a part of the pictures moves by itself (a screen, what passes a "
+            "window), or frames are in wrong places"
+        )
     if found.share < LEAST_SHARE and outcome.method == "sfm":
-        raise StageError(f"the cameras are wrong: {figure}", hint=doubt)
+        raise StageError(f"the cameras are wrong: {figure}{why}", hint=doubt)
     kept = outcome.method == "given" and (outcome.missed_px or 0.0) <= config.refine_above
-    least = STRANGE_SHARE if outcome.strange_lens else GOOD_SHARE
     if found.share < GOOD_SHARE and kept:
         reporter.warn(f"the poses of the input are doubtful: {figure}; ingest.refine_above keeps them")
     elif found.share < least:
-        strange = ", and they ask for a lens that nobody builds" if outcome.strange_lens else ""
-        return (f"cameras that the images confirm: {figure}, fewer than {least:.0%}{strange}; {doubt}",)
+        return (f"cameras that the images confirm: {figure}, fewer than {least:.0%}{why}; {doubt}",)
     else:
         reporter.info(f"cameras: {figure}")
     return ()

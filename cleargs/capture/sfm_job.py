@@ -30,6 +30,9 @@ OUTCOME = "outcome.json"
 GOOD_SHARE, LEAST_SHARE, STRANGE_SHARE, MIN_KEYPOINTS = 0.5, 0.25, 0.8, 100
 """Shares of the kept-out keypoints within 2 px below which ingest is done only in part, fails, and is done
 only in part if the matches ask for a lens that is not believed; fewest keypoints that count."""
+SECOND_MOTION, STILL_SHARE = 0.15, 0.9
+"""Share of the pairs of frames with a second motion from which ingest is done only in part if fewer than the
+second share of the kept-out keypoints are within 2 px (docs/experiments/poses.md)."""
 
 
 class Job(FrozenModel):
@@ -89,6 +92,9 @@ class SfmOutcome(FrozenModel):
     """True if SfM found, or the matches ask for, a lens that is not believed (`lenses.is_impossible`)."""
     little_depth: bool = False
     """True if few pairs of frames show depth (`parallax.LITTLE_BELOW`)."""
+    second_motion: float = 0.0
+    """Share of the pairs of frames in which matches agree with each other, but not with the cameras
+    (`capture.second_motion`)."""
     shifts_px: Mapping[str, tuple[float, float]] = Field(default_factory=dict)
     """Working image -> shift of its picture by a stabiliser, px; empty: none was found."""
     elsewhere: Sequence[str] = ()

@@ -31,6 +31,7 @@ from cleargs.capture.lenses import FISHEYE_AHEAD, GAIN, Fit, fitted, is_impossib
 from cleargs.capture.mapping import Mapper, names_in
 from cleargs.capture.parallax import LITTLE_BELOW, NO_DEPTH_BELOW, depth_share
 from cleargs.capture.prediction import scales_differ
+from cleargs.capture.second_motion import second_motion
 from cleargs.capture.sfm_features import FIRST
 from cleargs.capture.sfm_job import LITTLE_DEPTH, MOVE, NO_DEPTH, OUTCOME, OWN, Job, SfmOutcome
 from cleargs.capture.steady import steadied
@@ -153,6 +154,7 @@ class Sfm(Mapper):
             strange_lens=fit.adjuster.asks_for_strange_lens
             or any(map(is_impossible, model.cameras.values())),
             little_depth=deep <= LITTLE_BELOW,
+            second_motion=0.0 if shifts else round(second_motion(model, tried.used_database), 6),
             shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
             prediction=figure,
             predictions=figures,

@@ -80,14 +80,17 @@ def _print(rng: np.random.Generator) -> ArrayF64:
 
 def make_textures(rng: np.random.Generator) -> ArrayF32:  # [textures, texels of all levels, 3]
     """Return `SURFACES` materials, then `PRINTS` posters, with box-filtered mip levels, in linear RGB."""
-    chains = []
-    for image in [_surface(rng) for _ in range(SURFACES)] + [_print(rng) for _ in range(PRINTS)]:
-        current, chain = np.clip(image, 0.01, 0.98), []
-        for _ in range(LEVELS):
-            chain.append(current.reshape(-1, 3).astype(np.float32))
-            current = (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2]) / 4
-        chains.append(np.concatenate(chain))
-    return np.stack(chains)
+    images = [_surface(rng) for _ in range(SURFACES)] + [_print(rng) for _ in range(PRINTS)]
+    return np.stack([mip_levels(image) for image in images])
+
+
+def mip_levels(image: ArrayF64) -> ArrayF32:  # [SIZE, SIZE, 3] linear RGB -> [texels of all levels, 3]
+    """Return the box-filtered mip levels of a texture."""
+    current, chain = np.clip(image, 0.01, 0.98), []
+    for _ in range(LEVELS):
+        chain.append(current.reshape(-1, 3).astype(np.float32))
+        current = (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2]) / 4
+    return np.concatenate(chain)
 
 
 PRIMITIVE = np.dtype(

@@ -14,7 +14,20 @@ from cleargs.synth.optics import Lens, instant_shutter, phone_lens
 from cleargs.synth.path import Orbit, look_at
 from cleargs.synth.phone import develop
 from cleargs.synth.raycast import RoomWorld
-from cleargs.synth.room import DEPTH, ROD, Room, make_room
+from cleargs.synth.room import (
+    BOX,
+    DEPTH,
+    HEIGHT,
+    PRINTS,
+    ROD,
+    SURFACES,
+    WIDTH,
+    Room,
+    make_room,
+    mip_levels,
+    primitive,
+)
+from cleargs.synth.room import SIZE as TEXELS
 from cleargs.types import ArrayF64, ImageU8
 
 SIZE = (320, 240)
@@ -108,6 +121,25 @@ def turntable(seed: int, frames: int, size: tuple[int, int] = SIZE) -> Iterator[
         light = things.render(instant_shutter(pose, lens.height), lens)
         seen = (things.depth(pose, lens) < empty.depth(pose, lens) - 1e-6)[..., None]
         yield develop(np.where(seen, light, behind), noise=1 / 255, rng=np.random.default_rng(number))
+
+
+def text_wall(seed: int, frames: int, size: tuple[int, int], speed: int) -> Iterator[ImageU8]:
+    """Yield pictures of a walk before a wall of text that moves up by ``speed`` texels per frame."""
+    random, room = np.random.default_rng(seed), make_room(seed)
+    page = np.full((TEXELS, TEXELS, 3), 240, np.uint8)
+    for row in range(22, TEXELS, 22):
+        line = " ".join("".join(random.choice([*"aeinorst"], 4)) for _ in range(12))
+        left = int(random.integers(4, 44))
+        cv2.putText(page, line, (left, row), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (60, 20, 20), 1, cv2.LINE_AA)
+    middle = (0.0, HEIGHT / 2, -DEPTH / 2 + 0.03)
+    wall = primitive(
+        BOX, middle, (WIDTH / 2 - 0.05, HEIGHT / 2 - 0.01, 0.012), SURFACES + PRINTS, shadow=False
+    )
+    primitives = np.append(room.primitives, wall)
+    for number, pose in enumerate(walk(seed, frames)):
+        shown = mip_levels((np.roll(page, -speed * number, axis=0) / 255.0) ** 2.2)
+        textures = np.concatenate([room.textures, shown[None]])
+        yield shoot(replace(room, primitives=primitives, textures=textures), pose, phone_lens(*size), number)
 
 
 def stabilised(seed: int, frames: int, crop: float = 1.1, shift: float = 0.04) -> Iterator[ImageU8]:
