@@ -56,7 +56,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
 FEW_FRAMES, GOOD_FRAMES = 20, 30
 """Number of frames below which a warning is given, and the number that it asks for."""
 
-VERSION = 28
+VERSION = 29
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -210,7 +210,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     write_motion(context.out / "motion.parquet", frames, motion)
     scene.similarity.write(context.out)
     return StageResult(
-        missing=contradictions(outcome, config, reporter),
+        missing=contradictions(outcome, config, reporter, rolled=bool(motion.readouts)),
         summary=IngestSummary(
             kind=capture.kind,
             input=capture.told,

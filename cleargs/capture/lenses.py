@@ -21,7 +21,7 @@ from cleargs.capture.adjustment import Adjuster, has_strange_aspect, lens_of, se
 from cleargs.capture.camera_models import FIRST_LENS, FULL_LENS
 from cleargs.capture.cameras import has_usual_focal
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.motion import TWIST, projected
+from cleargs.capture.frame_fit import MIN_KEYPOINTS, misses_of, robust_step, slopes_of
 from cleargs.capture.prediction import WITHIN_PX, prediction_errors
 from cleargs.capture.sfm_job import Job, Prediction
 from cleargs.types import ArrayF64
@@ -35,7 +35,7 @@ length per frame changed the median by -1 to 2 % in eight rooms without a change
 focal length breathes by 1.5 %; its mean changed by -9 %."""
 CAPPED_PX = 4.0
 """Largest error of a keypoint in the mean."""
-FOCAL_DOUBT, FOCAL_CHANGE, MIN_KEYPOINTS = 4.0, 1e-3, 30
+FOCAL_DOUBT, FOCAL_CHANGE = 4.0, 1e-3
 """A focal length per frame is tried if the keypoints of the frames ask for changes of more than this number
 of standard errors and by more than this share (root mean squares over the frames). In a room without a change
 these are 0.9 and 0.0002, in one whose focal length breathes by 1.5 % 22 and 0.005. Frames with fewer
@@ -236,23 +236,11 @@ def _focal_length_changes(model: pycolmap.Reconstruction) -> bool:
     for image in model.images.values():
         if not image.has_pose or image.num_points3D < MIN_KEYPOINTS:
             continue
-        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
-        seen = image.get_observation_points2D()
-        points = np.array([model.points3D[keypoint.point3D_id].xyz for keypoint in seen])
-        points = points @ pose.rotation.matrix().T + pose.translation
-        misses = np.array([keypoint.xy for keypoint in seen]) - camera.img_from_cam(points)
-        place, slopes = projected(points, np.zeros((len(points), TWIST)))
-        slopes = camera.mean_focal_length() * np.concatenate([slopes, place[..., None]], axis=2)
-        weight = 1.0 / (1.0 + np.einsum("mc,mc->m", misses, misses))
-        matrix = np.einsum("mca,m,mcb->ab", slopes, weight, slopes)
-        size = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-        inverse = np.linalg.inv(matrix / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(
-            size, size
-        )
-        step = inverse @ np.einsum("mca,m,mc->a", slopes, weight, misses)
-        left = misses - slopes @ step
-        variance = np.einsum("mc,m,mc->", left, weight, left) / max(1.0, 2.0 * weight.sum() - len(step))
-        found.append((step[-1], np.sqrt(variance * inverse[-1, -1])))
+        points, _, misses = misses_of(model, image)
+        focal = model.cameras[image.camera_id].mean_focal_length()
+        place, slopes = slopes_of(points, focal)
+        step, covariance = robust_step(np.concatenate([slopes, focal * place[..., None]], axis=2), misses)
+        found.append((step[-1], np.sqrt(covariance[-1, -1])))
     if not found:
         return False
     changes, errors = np.array(found).T

@@ -34,10 +34,12 @@ from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_job import (
     GOOD_SHARE,
+    HALVES_APART,
     LEAST_SHARE,
     LITTLE_DEPTH,
     MIN_KEYPOINTS,
     MOVE,
+    MUCH_MOTION,
     NO_DEPTH,
     OUTCOME,
     OWN,
@@ -213,12 +215,23 @@ def reconstruct(
     return Reconstruction(model, worlds[outcome.convention][0], outcome)
 
 
-def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -> tuple[str, ...]:
+def contradictions(
+    outcome: SfmOutcome, config: SfmConfig, reporter: Reporter, *, rolled: bool = False
+) -> tuple[str, ...]:
     """Report the errors of the cameras at the kept-out keypoints. Return a line if these contradict them.
 
+    Halves of the pictures that disagree are a warning, unless the shutter is known to roll (``rolled``).
     Raises StageError if found cameras are so wrong that no scene is possible. Poses of the input that
     ``config.refine_above`` keeps give a warning only.
     """
+    apart = outcome.halves_apart >= HALVES_APART and not rolled
+    if apart:
+        reporter.warn(
+            f"the upper and the lower half of the pictures place the camera {outcome.halves_apart:.1%} of "
+            "the size of its path apart, and its poses are about as wrong: a shutter that rolls, a part that "
+            "moves by itself, or another lens. Give the video instead of pictures, mask what moves (masks/), "
+            "or hold still"
+        )
     found = outcome.prediction
     if found is None or found.keypoints < MIN_KEYPOINTS:
         return ()
@@ -230,7 +243,8 @@ def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -
     why = ""
     if outcome.strange_lens:
         least, why = STRANGE_SHARE, ", and they ask for a lens that nobody builds"
-    if outcome.second_motion >= SECOND_MOTION:
+    torn = outcome.second_motion >= (SECOND_MOTION if apart else MUCH_MOTION)
+    if torn:
         least, doubt = STILL_SHARE, "mask what moves (masks/), or use more frames (ingest.max_frames)"
         why = (
             f"; in {outcome.second_motion:.0%} of the pairs of frames, many matches agree with each other, "
@@ -244,6 +258,8 @@ def contradictions(outcome: SfmOutcome, config: SfmConfig, reporter: Reporter) -
         reporter.warn(f"the poses of the input are doubtful: {figure}; ingest.refine_above keeps them")
     elif found.share < least:
         return (f"cameras that the images confirm: {figure}, fewer than {least:.0%}{why}; {doubt}",)
+    elif torn and apart:
+        return (f"cameras that the images confirm: {figure}{why}; {doubt}",)
     else:
         reporter.info(f"cameras: {figure}")
     return ()

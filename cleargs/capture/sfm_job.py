@@ -30,9 +30,13 @@ OUTCOME = "outcome.json"
 GOOD_SHARE, LEAST_SHARE, STRANGE_SHARE, MIN_KEYPOINTS = 0.5, 0.25, 0.8, 100
 """Shares of the kept-out keypoints within 2 px below which ingest is done only in part, fails, and is done
 only in part if the matches ask for a lens that is not believed; fewest keypoints that count."""
-SECOND_MOTION, STILL_SHARE = 0.15, 0.9
-"""Share of the pairs of frames with a second motion from which ingest is done only in part if fewer than the
-second share of the kept-out keypoints are within 2 px (docs/experiments/poses.md)."""
+HALVES_APART = 0.01
+"""`SfmOutcome.halves_apart` from which a warning is given, unless a readout explains it. Observed: at most
+0.0034 of right cameras; 0.011 to 0.05 of cameras that skew or a second motion makes 5 to 39 % wrong
+(docs/experiments/poses.md)."""
+SECOND_MOTION, MUCH_MOTION, STILL_SHARE = 0.1, 0.25, 0.9
+"""Shares of the pairs of frames with a second motion from which ingest is done only in part if the halves of
+the pictures are `HALVES_APART`, or if fewer than the last share of the kept-out keypoints are within 2 px."""
 
 
 class Job(FrozenModel):
@@ -92,6 +96,9 @@ class SfmOutcome(FrozenModel):
     """True if SfM found, or the matches ask for, a lens that is not believed (`lenses.is_impossible`)."""
     little_depth: bool = False
     """True if few pairs of frames show depth (`parallax.LITTLE_BELOW`)."""
+    halves_apart: float = 0.0
+    """Distance between the places of the camera by the upper and the lower half of the pictures, a share of
+    the mean distance of the camera centres from their mean (`capture.frame_fit`)."""
     second_motion: float = 0.0
     """Share of the pairs of frames in which matches agree with each other, but not with the cameras
     (`capture.second_motion`)."""

@@ -26,6 +26,7 @@ from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import colmap_cameras, copy_features, create_database, set_cameras
+from cleargs.capture.frame_fit import halves_apart
 from cleargs.capture.kept_out import all_tracks, epipolar_errors, verified_matches, weakest_join
 from cleargs.capture.lenses import FISHEYE_AHEAD, GAIN, Fit, fitted, is_impossible, searched
 from cleargs.capture.mapping import Mapper, names_in
@@ -154,6 +155,7 @@ class Sfm(Mapper):
             strange_lens=fit.adjuster.asks_for_strange_lens
             or any(map(is_impossible, model.cameras.values())),
             little_depth=deep <= LITTLE_BELOW,
+            halves_apart=0.0 if shifts else round(halves_apart(model), 6),
             second_motion=0.0 if shifts else round(second_motion(model, tried.used_database), 6),
             shifts_px={model.images[key].name: (float(x), float(y)) for key, (x, y) in shifts.items()},
             prediction=figure,

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from cleargs.capture.adjustment import Adjuster, lens_of, set_lens
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
+from cleargs.capture.frame_fit import halves_apart
 from cleargs.capture.kept_out import all_tracks
 from cleargs.capture.lenses import Fit, is_impossible, lens_owners
 from cleargs.capture.prediction import prediction_errors, scales_differ
@@ -26,7 +27,17 @@ from cleargs.capture.sfm_job import Prediction, SfmOutcome
 from cleargs.errors import StageError
 from cleargs.progress import SilentReporter
 
-from .conftest import FOCAL, HEIGHT, PLANES, WIDTH, Ingest, Ingested, camera_to_world, texture
+from .conftest import (
+    FOCAL,
+    HEIGHT,
+    PLANES,
+    WIDTH,
+    Ingest,
+    Ingested,
+    RecordingReporter,
+    camera_to_world,
+    texture,
+)
 
 FRAMES = 12
 Rays = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -237,8 +248,42 @@ def test_the_figure_decides_between_placed_in_part_and_failed() -> None:
     # The same, slower: 83 %, and in 39 % of the pairs a second motion; centres are off by 39 %.
     assert "moves by itself" in said(0.83, second_motion=0.39)[0]
     assert said(0.83, second_motion=0.12) == () == said(0.96, second_motion=0.39)
+    # A frame in a wrong place: 91 %, and the halves of the pictures disagree, too; centres are off by 18 %.
+    assert "wrong places" in said(0.91, second_motion=0.14, halves_apart=0.023)[0]
+    assert said(0.91, second_motion=0.04, halves_apart=0.051) == ()
     with pytest.raises(StageError, match="the cameras are wrong"):
         said(0.2)
+
+
+def test_halves_of_the_pictures_that_disagree_are_a_warning_without_a_known_readout() -> None:
+    def warned(apart: float, **known: bool) -> list[str]:
+        reporter = RecordingReporter()
+        outcome = SfmOutcome(method="sfm", halves_apart=apart)
+        assert contradictions(outcome, SfmConfig(), reporter, **known) == ()
+        return reporter.warnings
+
+    (warning,) = warned(0.042)
+    assert "4.2% of the size of its path apart" in warning and "a shutter that rolls" in warning
+    assert warned(0.0034) == [] == warned(0.042, rolled=True)
+
+
+def test_the_halves_of_pictures_with_a_rolling_shutter_disagree() -> None:
+    """The camera moves by a tenth of the size of its path while a picture is read."""
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=8)
+    options.num_points3D, options.num_points2D_without_point3D = 400, 0
+    model = pycolmap.synthesize_dataset(options)
+    assert halves_apart(model) == 0
+    random = np.random.default_rng(0)
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        pose, step = image.cam_from_world().matrix(), random.normal(size=3)
+        size = np.linalg.norm(image.projection_center())
+        step *= 0.1 * size / np.linalg.norm(step)
+        for keypoint in image.points2D:
+            seen = pose[:, :3] @ model.points3D[keypoint.point3D_id].xyz + pose[:, 3]
+            late = keypoint.xy[1] / camera.height - 0.5
+            keypoint.xy = camera.img_from_cam(seen + late * step)
+    assert 0.01 < halves_apart(model) < 0.1
 
 
 def test_kept_out_keypoints_show_a_wrong_pose_and_another_scale(tmp_path: Path) -> None:
