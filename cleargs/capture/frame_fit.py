@@ -13,8 +13,8 @@ from cleargs.capture.colmap import pycolmap
 from cleargs.capture.motion import TWIST, projected
 from cleargs.types import ArrayF64
 
-MIN_KEYPOINTS = 30
-"""Fewest keypoints of a frame that counts."""
+MIN_KEYPOINTS, HALVED_FRAMES = 30, 60
+"""Fewest keypoints of a frame that counts, and most frames, evenly spread, whose halves are compared."""
 
 
 def misses_of(
@@ -60,13 +60,12 @@ def halves_apart(model: pycolmap.Reconstruction) -> float:
     It is the median over the frames, a share of the mean distance of the camera centres from their mean.
     What the uncertainty of the two places explains is taken off.
     """
-    placed = [image for image in model.images.values() if image.has_pose]
+    placed = [image for _, image in sorted(model.images.items()) if image.has_pose]
     centres = np.array([image.projection_center() for image in placed])
     size = max(float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()), 1e-12)
     squares = []
-    for image in placed:
-        if image.num_points3D < 2 * MIN_KEYPOINTS:
-            continue
+    rich = [image for image in placed if image.num_points3D >= 2 * MIN_KEYPOINTS]
+    for image in rich[:: -(-len(rich) // HALVED_FRAMES) or 1]:
         points, xy, misses = misses_of(model, image)
         _, slopes = slopes_of(points, model.cameras[image.camera_id].mean_focal_length())
         upper, scale = xy[:, 1] < np.median(xy[:, 1]), max(1.0, float(np.median(np.abs(misses))))
