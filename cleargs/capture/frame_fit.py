@@ -13,8 +13,9 @@ from cleargs.capture.colmap import pycolmap
 from cleargs.capture.motion import TWIST, projected
 from cleargs.types import ArrayF64
 
-MIN_KEYPOINTS, HALVED_FRAMES = 30, 60
-"""Fewest keypoints of a frame that counts, and most frames, evenly spread, whose halves are compared."""
+MIN_KEYPOINTS, HALVED_FRAMES, AHEAD = 30, 60, 0.2
+"""Fewest keypoints of a frame that counts; most frames, evenly spread, whose halves are compared; and least
+cosine of the angle off the axis of their keypoints: the slopes are those of a perspective lens."""
 
 
 def misses_of(
@@ -67,6 +68,10 @@ def halves_apart(model: pycolmap.Reconstruction) -> float:
     rich = [image for image in placed if image.num_points3D >= 2 * MIN_KEYPOINTS]
     for image in rich[:: -(-len(rich) // HALVED_FRAMES) or 1]:
         points, xy, misses = misses_of(model, image)
+        ahead = points[:, 2] > AHEAD * np.linalg.norm(points, axis=1)
+        if ahead.sum() < 2 * MIN_KEYPOINTS:
+            continue
+        points, xy, misses = points[ahead], xy[ahead], misses[ahead]
         _, slopes = slopes_of(points, model.cameras[image.camera_id].mean_focal_length())
         upper, scale = xy[:, 1] < np.median(xy[:, 1]), max(1.0, float(np.median(np.abs(misses))))
         halves = (robust_step(slopes[half], misses[half], scale) for half in (upper, ~upper))
