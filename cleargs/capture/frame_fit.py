@@ -1,8 +1,8 @@
-"""How the keypoints of a frame ask its camera to change, while the points stay; and if its halves agree.
+"""The change of a frame's camera that its keypoints ask for, while the points stay; and if its halves agree.
 
 The upper and the lower half of a picture see the scene at the same time and from the same place, unless a
-shutter rolls, a part moves by itself, or the lens is another one. Then each half asks for a pose of its own,
-although the pose of the whole explains most keypoints within 2 px.
+shutter rolls, a part moves by itself, or the lens is another one. Then the two halves ask for different
+poses, although the pose of the whole explains most keypoints within 2 px.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def halves_apart(model: pycolmap.Reconstruction) -> float:
     """Return how far apart the upper and the lower half of the pictures place the camera; 0 if they agree.
 
     It is the median over the frames, a share of the mean distance of the camera centres from their mean.
-    What the uncertainty of the two places explains is taken off.
+    The part that the uncertainty of the two places explains is taken off.
     """
     placed = [image for _, image in sorted(model.images.items()) if image.has_pose]
     centres = np.array([image.projection_center() for image in placed])

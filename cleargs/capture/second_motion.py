@@ -3,7 +3,7 @@
 A screen of text that scrolls, or a train behind a window, moves by itself. If it covers much of the pictures,
 mapping takes it, or a mixture of both motions, for the scene. Cameras that are 40 % off then predict 83 % of
 the kept-out keypoints, since these are of matches that fit the stronger motion of their pair of frames. The
-matches that contradict the cameras are many, and one homography explains them. Where cameras are right, such
+matches that contradict the cameras are many, and one homography explains them. If cameras are right, such
 matches are few, and contradict each other.
 """
 

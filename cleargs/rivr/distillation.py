@@ -73,7 +73,7 @@ def distil(
             label=label,
             device=start.device,
             round=round,
-            dust=config.densify != OFF,  # without new Gaussians there is hardly any since the first training
+            dust=config.densify != OFF,  # without new Gaussians there is little since the first training
             seed=seed,
             moments=start.files.moments(start.scene.gaussians),
             pseudo_share=even if pseudo_share == "even" else pseudo_share * repaired,

@@ -29,7 +29,7 @@ ERROR_STEPS = 5
 at most an eighth of the steps between refinements measure errors."""
 
 NOISE_EVERY = 4
-"""Number of steps from one noise on the means to the next, which has the variance of so many."""
+"""Number of steps from one noise on the means to the next, which has the variance of this many."""
 
 
 @dataclass

@@ -339,7 +339,7 @@ def test_a_later_training_keeps_what_was_looked_at_often(
 
 
 def test_frames_of_a_rolling_shutter_are_kept_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search in a short later training would put a worse motion in place of theirs."""
+    """A search in a short later training would put a worse motion in place of the known one."""
     looked: list[int] = []
 
     def look(frame: FrameFormation, *_: Any, **__: Any) -> FrameFormation:

@@ -181,10 +181,10 @@ def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple
 
 
 @device
-def beside(mean: float, size: int, row: Vector, largest: float) -> bool:
+def outside(mean: float, size: int, row: Vector, largest: float) -> bool:
     """Return True if an opaque sphere with the ``largest`` scale would touch no pixel; False for NaN.
 
-    The other numbers of a Gaussian, above all its SH, are not read then. In a room, half of them are beside
+    The other numbers of a Gaussian, above all its SH, are not read then. In a room, half of them are outside
     the image.
     """
     extent = math.sqrt(WIDEST * (dot(row, row) * largest * largest + DILATION)) + 1.0
@@ -204,7 +204,7 @@ def project_one(
 ) -> bool:
     """Write the packed splat of Gaussian ``g``.
 
-    Return False if it is behind, beside the image, too faint or not finite.
+    Return False if it is behind, outside the image, too faint or not finite.
     """
     means, log_scales, rotations, logits, sh = parameters
     x, y, z = camera_position(means[g], view)
@@ -213,7 +213,7 @@ def project_one(
     row0, row1 = projection_rows(x, y, z, view)
     mean_x, mean_y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
     largest = math.exp(max(log_scales[g, 0], log_scales[g, 1], log_scales[g, 2]))
-    if beside(mean_x, size[0], row0, largest) or beside(mean_y, size[1], row1, largest):
+    if outside(mean_x, size[0], row0, largest) or outside(mean_y, size[1], row1, largest):
         return False
     qw, qx, qy, qz, _ = unit_quaternion(rotations[g])
     sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])
