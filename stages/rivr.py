@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from cleargs.splat.views import TrainingView
 
 
-AUTO_SHARE = 0.125
+AUTO_SHARE = 1 / 16
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
 VERSION = 62
