@@ -245,9 +245,10 @@ def test_the_figure_decides_between_placed_in_part_and_failed() -> None:
         and "moves by itself" in said(0.65, strange_lens=True)[0]
     )
     assert said(0.65) == () == said(0.9, strange_lens=True)
-    # The same, slower: 83 %, and in 39 % of the pairs a second motion; centres are off by 39 %.
-    assert "moves by itself" in said(0.83, second_motion=0.39)[0]
-    assert said(0.83, second_motion=0.12) == () == said(0.96, second_motion=0.39)
+    # Too few photographs of a round: 64 %, and in 54 % of the pairs a second motion; centres are off by 70 %.
+    # A room whose posters repeat, with right cameras: 89 %, 29 %.
+    assert "moves by itself" in said(0.64, second_motion=0.54)[0]
+    assert said(0.89, second_motion=0.29) == () == said(0.89, second_motion=0.54)
     # A frame in a wrong place: 91 %, and the halves of the pictures disagree, too; centres are off by 18 %.
     assert "wrong places" in said(0.91, second_motion=0.14, halves_apart=0.023)[0]
     assert said(0.91, second_motion=0.04, halves_apart=0.051) == ()
