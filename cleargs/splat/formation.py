@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
 
 from cleargs.splat.camera import Camera
 from cleargs.splat.types import Render
-from cleargs.splat.views import TrainingView
+
+if TYPE_CHECKING:  # it needs OpenCV, and the kernels do not
+    from cleargs.splat.views import TrainingView
 
 Renderer = Callable[[Camera], Render]
 """Function that renders the current scene with depth."""
