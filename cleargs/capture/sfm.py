@@ -254,14 +254,13 @@ def contradictions(
     if found.share < LEAST_SHARE and outcome.method == "sfm":
         raise StageError(f"the cameras are wrong: {figure}{why}", hint=doubt)
     kept = outcome.method == "given" and (outcome.missed_px or 0.0) <= config.refine_above
-    if found.share < GOOD_SHARE and kept:
-        reporter.warn(f"the poses of the input are doubtful: {figure}; ingest.refine_above keeps them")
-    elif found.share < least:
-        return (f"cameras that the images confirm: {figure}, fewer than {least:.0%}{why}; {doubt}",)
-    elif torn and apart:
-        return (f"cameras that the images confirm: {figure}{why}; {doubt}",)
-    else:
+    few = f", fewer than {least:.0%}" if found.share < least else ""
+    if not few and not (torn and apart):
         reporter.info(f"cameras: {figure}")
+    elif kept:
+        reporter.warn(f"the poses of the input are doubtful: {figure}{why}; ingest.refine_above keeps them")
+    else:
+        return (f"cameras that the images confirm: {figure}{few}{why}; {doubt}",)
     return ()
 
 

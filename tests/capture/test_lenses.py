@@ -252,6 +252,11 @@ def test_the_figure_decides_between_placed_in_part_and_failed() -> None:
     # A frame in a wrong place: 91 %, and the halves of the pictures disagree, too; centres are off by 18 %.
     assert "wrong places" in said(0.91, second_motion=0.14, halves_apart=0.023)[0]
     assert said(0.91, second_motion=0.04, halves_apart=0.051) == ()
+    found = Prediction(keypoints=1000, share=0.91, median_px=1.0)
+    given = SfmOutcome(
+        prediction=found, method="given", missed_px=0.3, second_motion=0.14, halves_apart=0.023
+    )
+    assert contradictions(given, SfmConfig(), SilentReporter()) == (), "the user gave these poses"
     with pytest.raises(StageError, match="the cameras are wrong"):
         said(0.2)
 
