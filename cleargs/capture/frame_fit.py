@@ -11,6 +11,7 @@ import numpy as np
 
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.motion import TWIST, projected
+from cleargs.sequences import spread
 from cleargs.types import ArrayF64
 
 MIN_KEYPOINTS, HALVED_FRAMES, AHEAD = 30, 60, 0.2
@@ -66,7 +67,7 @@ def halves_apart(model: pycolmap.Reconstruction) -> float:
     size = max(float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()), 1e-12)
     squares = []
     rich = [image for image in placed if image.num_points3D >= 2 * MIN_KEYPOINTS]
-    for image in rich[:: -(-len(rich) // HALVED_FRAMES) or 1]:
+    for image in spread(rich, HALVED_FRAMES):
         points, xy, misses = misses_of(model, image)
         ahead = points[:, 2] > AHEAD * np.linalg.norm(points, axis=1)
         if ahead.sum() < 2 * MIN_KEYPOINTS:

@@ -38,8 +38,8 @@ CAPPED_PX = 4.0
 FOCAL_DOUBT, FOCAL_CHANGE = 4.0, 1e-3
 """A focal length per frame is tried if the keypoints of the frames ask for changes of more than this number
 of standard errors and by more than this share (root mean squares over the frames). In a room without a change
-these are 0.9 and 0.0002, in one whose focal length breathes by 1.5 % 22 and 0.005. Frames with fewer
-keypoints do not count."""
+these are 0.9 and 0.0002, in one whose focal length breathes by 1.5 % 22 and 0.005. Frames with fewer than
+`MIN_KEYPOINTS` do not count."""
 ALIKE, AS_GOOD = 0.015, 1.02
 """Largest difference of the logarithms of neighbouring focal lengths of frames that share a lens; twice it is
 the largest in all of them. Frames share lenses if the error is at most this many times that with one each."""

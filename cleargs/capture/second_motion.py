@@ -16,6 +16,7 @@ import numpy as np
 
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.kept_out import Pixels, epipolar_errors, pixels_in
+from cleargs.sequences import spread
 
 _APART, _MATCHES, _PAIRS, _MOST = 6, 60, 12, 240
 """Most frames from the first frame of a pair to its second, fewest matches of a pair that is judged; fewest
@@ -41,7 +42,7 @@ def second_motion(model: pycolmap.Reconstruction, database: Path) -> float:
         }
         pixels = pixels_in(opened)
     near = sorted(pair for pair in rows if abs(pair[0] - pair[1]) <= _APART and poses.keys() >= set(pair))
-    judged = near[:: -(-len(near) // _MOST)] if near else []
+    judged = spread(near, _MOST)
     if len(judged) < _PAIRS:
         return 0.0
     moving = 0
