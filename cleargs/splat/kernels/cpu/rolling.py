@@ -4,33 +4,27 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import prange
 
 from cleargs.splat.constants import NEAR
-from cleargs.splat.kernels.cpu.jit import device, kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.splat.kernels.cpu.projection import BLOCK
 from cleargs.splat.rolling import BEYOND, STEEPEST, STEPS, seen_at
 from cleargs.types import AnyArray, ArrayF32, ArrayF64
 
-_seen_at = device(seen_at)
+_seen_at = inlined(seen_at)
 
 
-@device
+@inlined
 def _bounded(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
+    value = limit if value > limit else value
+    return -limit if value < -limit else value
 
 
-@device
-def _place_of(slope: float, start: float, seen: Any, along: int) -> float:
-    across = seen[0] if along == 0 else seen[1]
-    return _bounded(slope * across / max(seen[2], NEAR) + start, BEYOND)
-
-
-@device
-def _gain(slope: float, seen: Any, speed: Any, along: int) -> float:
-    depth = max(seen[2], NEAR)
-    across, change = (seen[0], speed[0]) if along == 0 else (seen[1], speed[1])
-    return _bounded(slope / depth * (change - across / depth * speed[2]), STEEPEST)
+@inlined
+def _depth_of(z: float) -> float:
+    return z if z > NEAR else NEAR
 
 
 @kernel
@@ -47,25 +41,39 @@ def own_poses(
     pose, first, second = twists
     count = means.shape[0]
     for block in prange((count + BLOCK - 1) // BLOCK):
-        for g in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            x, y, z = means[g, 0], means[g, 1], means[g, 2]
-            still_x = w[0, 0] * x + w[0, 1] * y + w[0, 2] * z + w[0, 3]
-            still_y = w[1, 0] * x + w[1, 1] * y + w[1, 2] * z + w[1, 3]
-            still_z = w[2, 0] * x + w[2, 1] * y + w[2, 2] * z + w[2, 3]
-            place = _place_of(slope, start, (still_x, still_y, still_z), along)
+        begin = block * BLOCK
+        size = min(BLOCK, count - begin)
+        # One loop per step, so that LLVM vectorises the search for the places.
+        still_x, still_y, still_z, places = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        for n in range(size):
+            x, y, z = means[begin + n, 0], means[begin + n, 1], means[begin + n, 2]
+            still_x[n] = w[0, 0] * x + w[0, 1] * y + w[0, 2] * z + w[0, 3]
+            still_y[n] = w[1, 0] * x + w[1, 1] * y + w[1, 2] * z + w[1, 3]
+            still_z[n] = w[2, 0] * x + w[2, 1] * y + w[2, 2] * z + w[2, 3]
+        for n in range(size):
+            x, y, z = still_x[n], still_y[n], still_z[n]
+            place = _bounded(slope * (x if along == 0 else y) / _depth_of(z) + start, BEYOND)
             for _ in range(STEPS):
-                _, seen, speed = _seen_at(pose, first, second, place, still_x, still_y, still_z)
-                error = place - _place_of(slope, start, seen, along)
-                place = _bounded(place - error / (1.0 - _gain(slope, seen, speed, along)), BEYOND)
-            turn, seen, speed = _seen_at(pose, first, second, place, still_x, still_y, still_z)
-            depth = max(seen[2], NEAR)
-            rate = 0.0
-            if abs(place) < BEYOND:
-                rate = slope / depth / (1.0 - _gain(slope, seen, speed, along))
-            across, row = (seen[0], turn[0]) if along == 0 else (seen[1], turn[1])
-            by_x = rate * (row[0] - across / depth * turn[2][0])
-            by_y = rate * (row[1] - across / depth * turn[2][1])
-            by_z = rate * (row[2] - across / depth * turn[2][2])
+                _, seen, speed = _seen_at(pose, first, second, place, x, y, z)
+                depth = _depth_of(seen[2])
+                ratio = (seen[0] if along == 0 else seen[1]) / depth
+                error = place - _bounded(slope * ratio + start, BEYOND)
+                change = speed[0] if along == 0 else speed[1]
+                gain = _bounded(slope / depth * (change - ratio * speed[2]), STEEPEST)
+                place = _bounded(place - error / (1.0 - gain), BEYOND)
+            places[n] = place
+        for n in range(size):
+            g, place = begin + n, places[n]
+            turn, seen, speed = _seen_at(pose, first, second, place, still_x[n], still_y[n], still_z[n])
+            depth = _depth_of(seen[2])
+            ratio = (seen[0] if along == 0 else seen[1]) / depth
+            change = speed[0] if along == 0 else speed[1]
+            gain = _bounded(slope / depth * (change - ratio * speed[2]), STEEPEST)
+            rate = slope / depth / (1.0 - gain) if abs(place) < BEYOND else 0.0
+            row = turn[0] if along == 0 else turn[1]
+            by_x = rate * (row[0] - ratio * turn[2][0])
+            by_y = rate * (row[1] - ratio * turn[2][1])
+            by_z = rate * (row[2] - ratio * turn[2][2])
             for i in range(3):
                 own_x = turn[i][0] + speed[i] * by_x
                 own_y = turn[i][1] + speed[i] * by_y
