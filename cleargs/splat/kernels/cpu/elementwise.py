@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import prange
 
-from cleargs.splat.kernels.cpu.jit import device, kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.splat.kernels.cpu.projection import dot, scaled_axes, unit_quaternion
 from cleargs.types import AnyArray, ArrayF32
 
@@ -87,7 +87,7 @@ def affine_backward(
                 row_sums[y, channel, 3] += g
 
 
-@device
+@inlined
 def random_bits(key: np.uint64, count: np.uint64) -> np.uint64:
     """Return 64 random bits: number ``count`` of the sequence with this key."""
     bits = key + (count + np.uint64(1)) * _GOLDEN
@@ -96,7 +96,7 @@ def random_bits(key: np.uint64, count: np.uint64) -> np.uint64:
     return bits ^ (bits >> np.uint64(31))
 
 
-@device
+@inlined
 def normal_pair(key: np.uint64, count: np.uint64) -> tuple[float, float]:
     """Return two independent normal numbers (Box and Muller 1958), at most 6.8 standard deviations."""
     bits = random_bits(key, count)

@@ -12,7 +12,7 @@ from numba import prange
 
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.harmonics import sh_basis, sh_direction_gradient
-from cleargs.splat.kernels.cpu.jit import device, kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.splat.kernels.cpu.projection import (
     BLOCK,
     DILATION,
@@ -35,13 +35,13 @@ from cleargs.splat.kernels.cpu.projection import (
 from cleargs.types import AnyArray, ArrayF32
 
 
-@device
+@inlined
 def plus(u: Vector, a: float, v: Vector) -> Vector:
     """Return u + a v."""
     return (u[0] + a * v[0], u[1] + a * v[1], u[2] + a * v[2])
 
 
-@device
+@inlined
 def quaternion_gradient(
     w: float, x: float, y: float, z: float, c0: Vector, c1: Vector, c2: Vector
 ) -> tuple[float, float, float, float]:
@@ -54,7 +54,7 @@ def quaternion_gradient(
     )
 
 
-@device
+@inlined
 def colour_gradient(
     g: int,
     sh: ArrayF32,
@@ -85,7 +85,7 @@ def colour_gradient(
     return np.float64(gx), np.float64(gy), np.float64(gz)
 
 
-@device
+@inlined
 def backpropagate_one(
     g: int,
     parameters: Parameters,
@@ -208,11 +208,15 @@ def backpropagate(
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             begin, end = pair_offsets[g], pair_offsets[g + 1]
             if begin == end:  # it touches no tile
-                grad_means[g, :] = ZERO
-                grad_log_scales[g, :] = ZERO
-                grad_rotations[g, :] = ZERO
+                for axis in range(3):
+                    grad_means[g, axis] = ZERO
+                    grad_log_scales[g, axis] = ZERO
+                for part in range(4):
+                    grad_rotations[g, part] = ZERO
                 grad_logits[g] = ZERO
-                grad_sh[g, :, :] = ZERO
+                for k in range(grad_sh.shape[1]):
+                    for channel in range(3):
+                        grad_sh[g, k, channel] = ZERO
                 continue
             sums[:] = 0.0
             for pair in range(begin, end):

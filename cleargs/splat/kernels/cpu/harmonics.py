@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cpu.jit import device
+from cleargs.splat.kernels.cpu.jit import inlined
 from cleargs.types import ArrayF32
 
 C0, C1 = np.float32(constants.SH_C0), np.float32(constants.SH_C1)
@@ -14,7 +14,7 @@ C30, C31, C32, C33, C34, C35, C36 = (np.float32(c) for c in constants.SH_C3)
 TWO, THREE, FOUR, SIX, EIGHT = (np.float32(n) for n in (2, 3, 4, 6, 8))
 
 
-@device
+@inlined
 def sh_basis(count: int, x: np.float32, y: np.float32, z: np.float32, basis: ArrayF32) -> None:
     """Write the first ``count`` (1, 4, 9 or 16) basis functions at the unit direction (x, y, z)."""
     basis[0] = C0
@@ -39,7 +39,7 @@ def sh_basis(count: int, x: np.float32, y: np.float32, z: np.float32, basis: Arr
         basis[15] = C36 * x * (xx - THREE * yy)
 
 
-@device
+@inlined
 def sh_direction_gradient(
     count: int, x: np.float32, y: np.float32, z: np.float32, h: ArrayF32
 ) -> tuple[np.float32, np.float32, np.float32]:

@@ -77,13 +77,11 @@ def serial_kernel(function: F) -> F:
     return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
-def device(function: F) -> F:
-    """Compile a function that kernels call."""
-    return cast(F, njit(fastmath=set(FAST), error_model="numpy")(function))
-
-
 def inlined(function: F) -> F:
-    """Compile a small function that LLVM must inline, so that SIMD values stay in registers."""
+    """Compile a function that LLVM must inline into its caller.
+
+    Tuples and SIMD values then stay in registers, and LLVM can vectorise a loop that calls the function.
+    """
     return cast(F, njit(fastmath=set(FAST), error_model="numpy", forceinline=True)(function))
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from numba import prange
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cpu.jit import device, kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.splat.kernels.cpu.simd import LANES, broadcast, load, magnitude, select, store
 from cleargs.types import AnyArray, ArrayF32
 
@@ -80,7 +80,7 @@ def pad_images(
                 counted[y, i] = ONE
 
 
-@device
+@inlined
 def vertical_means(y: int, image: ArrayF32, target: ArrayF32, window: ArrayF32, rows: ArrayF32) -> None:
     """Write the five window sums over the rows around ``y`` into the row buffers."""
     height, length = image.shape
@@ -105,7 +105,7 @@ def vertical_means(y: int, image: ArrayF32, target: ArrayF32, window: ArrayF32, 
         store(rows, MEAN_XY * length + i, sum_xy)
 
 
-@device
+@inlined
 def row_total(values: ArrayF32, length: int) -> float:
     """Return the sum of a row buffer in float64, without the padding."""
     total = 0.0

@@ -32,7 +32,7 @@ from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.binning import count_tiles
 from cleargs.splat.kernels.cpu.harmonics import sh_basis
-from cleargs.splat.kernels.cpu.jit import device, kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.types import AnyArray, ArrayF32
 
 DILATION = constants.DILATION
@@ -85,7 +85,7 @@ class ProjectionView(NamedTuple):
     bottom: float
 
 
-@device
+@inlined
 def own_view(g: int, view: ProjectionView, poses: AnyArray) -> ProjectionView:
     """Return the view of Gaussian ``g``: by its row of ``poses`` [N, 12], or of [0, 12] the view itself."""
     if len(poses) == 0:
@@ -98,36 +98,36 @@ def own_view(g: int, view: ProjectionView, poses: AnyArray) -> ProjectionView:
     )  # fmt: skip
 
 
-@device
+@inlined
 def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@device
+@inlined
 def cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@device
+@inlined
 def mixed(a: float, u: Vector, b: float, v: Vector) -> Vector:
     """Return a u + b v."""
     return (a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2])
 
 
-@device
+@inlined
 def residual(u0: Vector, u1: Vector, skew: float) -> Vector:
     """Return w = u0 - k u1, the variation of x at fixed y."""
     return (u0[0] - skew * u1[0], u0[1] - skew * u1[1], u0[2] - skew * u1[2])
 
 
-@device
+@inlined
 def is_finite(x: Any) -> bool:
     """Return True if a float64 is in the range of float32, in which it is stored; False for NaN."""
     finite: bool = abs(x) <= FLOAT32_MAX
     return finite
 
 
-@device
+@inlined
 def camera_position(mean: AnyArray, view: ProjectionView) -> Vector:
     """Return the Gaussian's centre in camera coordinates."""
     x, y, z = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
@@ -138,7 +138,7 @@ def camera_position(mean: AnyArray, view: ProjectionView) -> Vector:
     )
 
 
-@device
+@inlined
 def direction_to(mean: AnyArray, view: ProjectionView) -> tuple[Vector, float]:
     """Return the unit vector in the world from the camera to the Gaussian's centre, and their distance."""
     x, y = np.float64(mean[0]) - view.centre_x, np.float64(mean[1]) - view.centre_y
@@ -147,7 +147,7 @@ def direction_to(mean: AnyArray, view: ProjectionView) -> tuple[Vector, float]:
     return (x / distance, y / distance, z / distance), distance
 
 
-@device
+@inlined
 def unit_quaternion(rotation: AnyArray) -> tuple[float, float, float, float, float]:
     """Return the normalised quaternion w x y z and the norm that it was divided by."""
     w, x = np.float64(rotation[0]), np.float64(rotation[1])
@@ -156,7 +156,7 @@ def unit_quaternion(rotation: AnyArray) -> tuple[float, float, float, float, flo
     return w / norm, x / norm, y / norm, z / norm, norm
 
 
-@device
+@inlined
 def scaled_axes(
     w: float, x: float, y: float, z: float, sx: float, sy: float, sz: float
 ) -> tuple[Vector, Vector, Vector]:
@@ -168,7 +168,7 @@ def scaled_axes(
     )
 
 
-@device
+@inlined
 def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple[Vector, Vector]:
     """Return the rows of J W. The clamps of x/z and y/z keep the linearisation near the image."""
     jx, jy = view.fx / z, view.fy / z
@@ -180,7 +180,7 @@ def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple
     )
 
 
-@device
+@inlined
 def outside(mean: float, size: int, row: Vector, largest: float) -> bool:
     """Return True if an opaque sphere with the ``largest`` scale would touch no pixel; False for NaN.
 
@@ -191,7 +191,7 @@ def outside(mean: float, size: int, row: Vector, largest: float) -> bool:
     return mean + extent < 0.0 or mean - extent > size + layout.TILE  # tiles may end beyond the image
 
 
-@device
+@inlined
 def project_one(
     g: int,
     parameters: Parameters,

@@ -30,7 +30,7 @@ from numba import prange
 
 from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
-from cleargs.splat.kernels.cpu.jit import device, kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.splat.kernels.cpu.pieces import (
     COLUMN_DX,
     EXP2_MIN,
@@ -98,7 +98,7 @@ GEOMETRY_BACKWARD = 1824
 BACKWARD_SIZE = GEOMETRY_BACKWARD + BATCH * GEOMETRY_SIZE
 
 
-@device
+@inlined
 def forward_tile(
     begin: int,
     end: int,
@@ -203,7 +203,7 @@ def forward(
                     depth[y, x] = buffer[DEPTH_FORWARD + i]
 
 
-@device
+@inlined
 def backward_tile(
     begin: int,
     end: int,
