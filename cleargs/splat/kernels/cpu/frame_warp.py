@@ -174,21 +174,23 @@ def _flow(x: Any, y: Any, near: Any, twist: Any) -> tuple[Any, Any]:
 @inlined
 def _nearness(depth: Any, alpha: Any, row: Any, column: Any, median: Any) -> Any:
     """Return the median depth over the depth of a pixel; 1 where it has none."""
+    # Without branches, so that loops over pixels are vectorised.
     covered, behind = alpha[row, column], depth[row, column]
-    if covered > np.float32(layout.MIN_COVERED) and behind > _ZERO:  # false for NaN
-        return min(median * covered / behind, np.float32(layout.MAX_NEARNESS))
-    return _ONE
+    seen = (covered > np.float32(layout.MIN_COVERED)) & (behind > _ZERO)  # false for NaN
+    near = median * covered / behind
+    near = near if near < np.float32(layout.MAX_NEARNESS) else np.float32(layout.MAX_NEARNESS)
+    return near if seen else _ONE
 
 
 @inlined
-def _read_flow(row: Any, column: Any, x: Any, y: Any, depth: Any, alpha: Any, lens: Any, twist: Any) -> Any:
+def _read_flow(row: Any, column: Any, x: Any, y: Any, depth: Any, alpha: Any, sizes: Any, twist: Any) -> Any:
     """Return the displacement, px, of a pixel (``row``, ``column`` of ``depth``) under a long ``twist``.
 
     It is the second-order solution (midpoint rule) of the motion along the path, with the nearness of the
-    point that the pixel sees.
+    point that the pixel sees. ``sizes`` are fx, fy over fx, and the median depth.
     """
     rows, columns = depth.shape
-    fx, ratio, median = lens[layout.FX], lens[layout.FY] / lens[layout.FX], lens[layout.MEDIAN]
+    fx, ratio, median = sizes
     along_x, along_y = _flow(x, y, _nearness(depth, alpha, row, column, median), twist)
     half = _HALF / fx
     for _ in range(layout.READ_STEPS):
@@ -212,11 +214,16 @@ def read_displacements(
     """Compute the displacements, px, of all pixels by the readout alone."""
     height, width = depth.shape
     for row in prange(height):
-        y = (np.float32(row) + _HALF - lens[layout.CY]) / lens[layout.FY]
+        # Numbers instead of arrays, so that the loop over the pixels is vectorised.
+        fx, fy, cx = lens[layout.FX], lens[layout.FY], lens[layout.CX]
+        sizes = fx, fy / fx, lens[layout.MEDIAN]
+        pose, skew, skew_bend = _twist(twists, 0), _twist(twists, 1), _twist(twists, 2)
+        y = (np.float32(row) + _HALF - lens[layout.CY]) / fy
+        read_down = down[row]
         for column in range(width):
-            x = (np.float32(column) + _HALF - lens[layout.CX]) / lens[layout.FX]
-            twist = _at_readout(twists[0], twists[1], twists[2], down[row] + across[column])
-            along_x, along_y = _read_flow(row, column, x, y, depth, alpha, lens, twist)
+            x = (np.float32(column) + _HALF - cx) / fx
+            twist = _at_readout(pose, skew, skew_bend, read_down + across[column])
+            along_x, along_y = _read_flow(row, column, x, y, depth, alpha, sizes, twist)
             offset[0, row, column] = along_x
             offset[1, row, column] = along_y
 
@@ -233,6 +240,18 @@ def _at_readout(pose: Any, skew: Any, skew_bend: Any, read: Any) -> Any:  # [6] 
         pose[4] + read * skew[4] + again * skew_bend[4],
         pose[5] + read * skew[5] + again * skew_bend[5],
     )
+
+
+@inlined
+def _write_flow(
+    out: Any, part: Any, row: Any, nearness: Any, y: Any, fx: Any, cx: Any, ratio: Any, twist: Any
+) -> None:
+    """Write the displacements of a row under ``twist`` to the planes ``part`` and ``part + 1`` of ``out``."""
+    for column in range(len(nearness)):
+        x = (np.float32(column) + _HALF - cx) / fx
+        along_x, along_y = _flow(x, y, nearness[column], twist)
+        out[part, row, column] = along_x
+        out[part + 1, row, column] = along_y * ratio
 
 
 @kernel
@@ -258,33 +277,38 @@ def displacements(
     twists = motion[layout.TWISTS :].reshape(6, 6)
     rolls = np.any(motion[layout.SKEW] != _ZERO)
     for row in prange(height):
+        # Numbers instead of arrays, and a loop for each field, so that the loops are vectorised.
+        median, disc, focus = motion[layout.MEDIAN], motion[layout.DISC], motion[layout.FOCUS]
+        ratio, sizes = fy / fx, (fx, fy / fx, median)
+        pose, blur = _twist(twists, 0), _twist(twists, 1)
+        skew, skew_bend = _twist(twists, 2), _twist(twists, 3)
+        bend, cube = _twist(twists, 4), _twist(twists, 5)
+        read_across = motion[layout.READ_ACROSS]
         down = motion[layout.READ_DOWN] * np.float32((row + 0.5) / height - 0.5)
         y = (np.float32(row) + _HALF - cy) / fy
+        nearness = np.empty(width, np.float32)
+        for column in range(width):
+            nearness[column] = _nearness(depth, alpha, row + margin, column + margin, median)
+        if rolls:
+            for column in range(width):
+                x = (np.float32(column) + _HALF - cx) / fx
+                read = down + read_across * np.float32((column + 0.5) / width - 0.5)
+                moved = _at_readout(pose, skew, skew_bend, read)
+                along_x, along_y = _read_flow(row + margin, column + margin, x, y, depth, alpha, sizes, moved)
+                offset[0, row, column] = along_x
+                offset[1, row, column] = along_y
+        else:
+            _write_flow(offset, 0, row, nearness, y, fx, cx, ratio, pose)
+        _write_flow(sweep, 0, row, nearness, y, fx, cx, ratio, blur)
+        for column in range(width):
+            radius[row, column] = disc * abs(nearness[column] - focus)
+        if curve is not None:
+            _write_flow(curve, 0, row, nearness, y, fx, cx, ratio, bend)
+            _write_flow(curve, 2, row, nearness, y, fx, cx, ratio, cube)
         farthest = 0.0
         for column in range(width):
-            x = (np.float32(column) + _HALF - cx) / fx
-            near = _nearness(depth, alpha, row + margin, column + margin, motion[layout.MEDIAN])
-            if rolls:
-                read = down + motion[layout.READ_ACROSS] * np.float32((column + 0.5) / width - 0.5)
-                moved = _at_readout(twists[0], twists[2], twists[3], read)
-                along_x, along_y = _read_flow(
-                    row + margin, column + margin, x, y, depth, alpha, motion, moved
-                )
-            else:
-                along_x, along_y = _flow(x, y, near, _twist(twists, 0))
-                along_y *= fy / fx
-            offset[0, row, column] = along_x
-            offset[1, row, column] = along_y
-            along_x, along_y = _flow(x, y, near, _twist(twists, 1))
-            sweep[0, row, column] = along_x
-            sweep[1, row, column] = along_y * (fy / fx)
-            radius[row, column] = motion[layout.DISC] * abs(near - motion[layout.FOCUS])
             vertical = abs(offset[1, row, column]) + np.float32(0.5) * abs(sweep[1, row, column])
             if curve is not None:
-                for part in range(2):
-                    along_x, along_y = _flow(x, y, near, _twist(twists, 4 + part))
-                    curve[2 * part, row, column] = along_x
-                    curve[2 * part + 1, row, column] = along_y * (fy / fx)
                 vertical += _curved_reach(curve[1, row, column], curve[3, row, column])
             farthest = max(farthest, np.float64(vertical + radius[row, column]))
         reach[row] = farthest
