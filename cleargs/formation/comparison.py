@@ -43,6 +43,9 @@ MIN_RESIDUAL = 5e-4
 
 HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
 """Side, px, of the blocks, of which every fourth is held out."""
+FIT_PIXELS = 50_000
+"""Number of pixels that are enough for a fit of at most 30 numbers. In larger images fits use every second,
+third, ... row (docs/experiments/formation.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +135,9 @@ class Level:
         counted = (reduced(weight) > 0.99).astype(np.float32)
         row, column = (np.arange(side) // HOLDOUT_BLOCK for side in counted.shape)
         holdout = (column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0  # no two blocks share a side
-        self._fitting, self._holdout = counted * ~holdout, counted * holdout
+        every = max(1, counted.size // FIT_PIXELS)
+        fitting = ~holdout * (np.arange(len(counted)) % every == 0)[:, None] * np.float32(every)
+        self._fitting, self._holdout = counted * fitting, counted * holdout
         if not self._holdout.any():  # an image of a few blocks
             self._holdout = self._fitting = counted
         self._total = max(float(self._holdout.sum(dtype=np.float64)), 1.0)
