@@ -53,11 +53,14 @@ from cleargs.rivr.tables import (
     write_selection,
 )
 from cleargs.rivr.targets import load_supervision
+from cleargs.scene import training as scene_training
 from cleargs.scene import viewer
+from cleargs.scene.dust import Dusted, without_dust
 from cleargs.scene.measure import ViewPsnr, evaluate_views
 from cleargs.scene.viewer import SceneViewer
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.scene import Scene
+from cleargs.splat.training import Trained
 from cleargs.splat.views import TrainingView
 from cleargs.stages import consolidate, rivr
 
@@ -287,6 +290,22 @@ def test_a_scene_is_compared_with_few_frames(capture: Capture, monkeypatch: pyte
     views = [view for _, view in sorted(supervision.views.items())][:7]
     assert SceneViewer(capture.root / "g0").psnr_unseen(views) is not None
     assert compared == [views[0].frame_id, views[3].frame_id, views[6].frame_id]
+
+
+@pytest.mark.parametrize("densify", [False, True])
+def test_dust_is_looked_for_where_gaussians_are_added(
+    densify: bool, capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[int] = []
+
+    def counted(trained: Trained, *rest: Any) -> Dusted:
+        looked.append(trained.scene.gaussians.num)
+        return without_dust(trained, *rest)
+
+    monkeypatch.setattr(scene_training, "without_dust", counted)
+    distil = {"steps": 12, "densify": densify}
+    rivr.run(capture.context("rivr", tiny_rivr(rounds=1, distil=distil)))
+    assert bool(looked) == densify
 
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
