@@ -43,9 +43,9 @@ MIN_RESIDUAL = 5e-4
 
 HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
 """Side, px, of the blocks, of which every fourth is held out."""
-FIT_PIXELS = 50_000
+FIT_PIXELS = 100_000
 """Number of pixels that are enough for a fit of at most 30 numbers. In larger images fits use every second,
-third, ... row (docs/experiments/formation.md)."""
+third, ... row (docs/experiments/formation.md#pixels-of-a-fit)."""
 
 
 @dataclass(frozen=True, eq=False)
