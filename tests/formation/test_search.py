@@ -26,6 +26,7 @@ from helpers.observations import (
 )
 from scipy.ndimage import map_coordinates
 
+from cleargs.formation import comparison
 from cleargs.formation.comparison import FramePair
 from cleargs.formation.motion import TWIST, FrameMotion, Model, flow_basis
 from cleargs.formation.search import preferred, refine, search
@@ -129,6 +130,20 @@ def test_a_fit_goes_on_from_the_last_one(truth: Image) -> None:
     nearly = replace(BLUR, blur=0.8 * BLUR.blur)
     still, found = refine(frame_pair(soft(truth), observe(truth, BLUR)), "blur", nearly)
     assert still.model == "none"
+    before = np.linalg.norm(nearly.blur - BLUR.blur)
+    assert np.linalg.norm(found.motion.blur - BLUR.blur) < 0.5 * before
+
+
+def test_a_large_image_is_fitted_by_some_of_its_rows(truth: Image, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They count for all, and the pixels that decide between models stay the same."""
+    sharp, filmed, nearly = soft(truth), observe(truth, BLUR), replace(BLUR, blur=0.8 * BLUR.blur)
+    whole = frame_pair(sharp, filmed).finest
+    monkeypatch.setattr(comparison, "FIT_PIXELS", HEIGHT * WIDTH // 3)
+    thinned = frame_pair(sharp, filmed)
+    assert thinned.finest.cost(nearly) != whole.cost(nearly)
+    assert thinned.finest.cost(nearly) == pytest.approx(whole.cost(nearly), rel=0.1)
+    assert thinned.finest.evaluate("blur", nearly).residual == whole.evaluate("blur", nearly).residual
+    _, found = refine(thinned, "blur", nearly)
     before = np.linalg.norm(nearly.blur - BLUR.blur)
     assert np.linalg.norm(found.motion.blur - BLUR.blur) < 0.5 * before
 
