@@ -279,7 +279,8 @@ def displacements(
     for row in prange(height):
         # Numbers instead of arrays, and a loop for each field, so that the loops are vectorised.
         median, disc, focus = motion[layout.MEDIAN], motion[layout.DISC], motion[layout.FOCUS]
-        ratio, sizes = fy / fx, (fx, fy / fx, median)
+        ratio = fy / fx
+        sizes = fx, ratio, median
         pose, blur = _twist(twists, 0), _twist(twists, 1)
         skew, skew_bend = _twist(twists, 2), _twist(twists, 3)
         bend, cube = _twist(twists, 4), _twist(twists, 5)

@@ -27,6 +27,12 @@ def _depth_of(z: float) -> float:
     return z if z > NEAR else NEAR
 
 
+@inlined
+def _gain(slope: float, seen: Any, speed: Any, ratio: float, along: int) -> float:
+    change = speed[0] if along == 0 else speed[1]
+    return _bounded(slope / _depth_of(seen[2]) * (change - ratio * speed[2]), STEEPEST)
+
+
 @kernel
 def own_poses(
     means: ArrayF32,  # [N, 3]
@@ -55,21 +61,18 @@ def own_poses(
             place = _bounded(slope * (x if along == 0 else y) / _depth_of(z) + start, BEYOND)
             for _ in range(STEPS):
                 _, seen, speed = _seen_at(pose, first, second, place, x, y, z)
-                depth = _depth_of(seen[2])
-                ratio = (seen[0] if along == 0 else seen[1]) / depth
+                ratio = (seen[0] if along == 0 else seen[1]) / _depth_of(seen[2])
                 error = place - _bounded(slope * ratio + start, BEYOND)
-                change = speed[0] if along == 0 else speed[1]
-                gain = _bounded(slope / depth * (change - ratio * speed[2]), STEEPEST)
-                place = _bounded(place - error / (1.0 - gain), BEYOND)
+                place = _bounded(place - error / (1.0 - _gain(slope, seen, speed, ratio, along)), BEYOND)
             places[n] = place
         for n in range(size):
             g, place = begin + n, places[n]
             turn, seen, speed = _seen_at(pose, first, second, place, still_x[n], still_y[n], still_z[n])
             depth = _depth_of(seen[2])
             ratio = (seen[0] if along == 0 else seen[1]) / depth
-            change = speed[0] if along == 0 else speed[1]
-            gain = _bounded(slope / depth * (change - ratio * speed[2]), STEEPEST)
-            rate = slope / depth / (1.0 - gain) if abs(place) < BEYOND else 0.0
+            rate = 0.0
+            if abs(place) < BEYOND:
+                rate = slope / depth / (1.0 - _gain(slope, seen, speed, ratio, along))
             row = turn[0] if along == 0 else turn[1]
             by_x = rate * (row[0] - ratio * turn[2][0])
             by_y = rate * (row[1] - ratio * turn[2][1])
