@@ -11,7 +11,8 @@ import numpy as np
 
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.database import copy_without_features, set_cameras, why_missing
-from cleargs.capture.kept_out import fitting_shares, verified_matches, weakest_join
+from cleargs.capture.kept_out import all_tracks, fitting_shares, verified_matches, weakest_join
+from cleargs.capture.prediction import scales_agree
 from cleargs.capture.sfm_features import AGAIN, FIRST, Features, FeatureSettings
 from cleargs.capture.sfm_job import Job
 from cleargs.errors import StageError
@@ -46,6 +47,8 @@ class Mapper(Features):
         self._options.mapper.num_threads = 1
         self._options.mapper.random_seed = job.seed
         self._options.triangulation.random_seed = job.seed
+        # COLMAP's 1.1 adjusts the whole model per tenth of growth: half as much time again, equal errors.
+        self._options.ba_global_frames_ratio = self._options.ba_global_points_ratio = 1.4
 
     def mapped(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
         """Return the model of the images alone, and how frames were placed."""
@@ -84,14 +87,14 @@ class Mapper(Features):
 
         The first pair of mapping may get a wrong focal length and depth, with which the first frames fit each
         other; the next ones then go on at another scale. The smaller side of such a join is placed again from
-        the larger one.
+        the larger one, unless points from each side alone show the same scale: then some matches are wrong.
         """
         if self._settled is not None and self._settled[0] is model and self._settled[1] == database:
             return model  # no frame was placed in between
         image, share = weakest_join(model, database)
         self._settled = None
         for _ in range(_JOINS):
-            if share >= _JOINED:
+            if share >= _JOINED or scales_agree(all_tracks(database), model, image):
                 self._settled = model, database
                 break
             numbers = {found.image_id - 1 for found in model.images.values() if found.has_pose}
@@ -111,8 +114,6 @@ class Mapper(Features):
         options = copy.deepcopy(self._options)
         options.min_model_size = min(_MIN_MODEL, max(3, total // 3))
         options.max_num_models = 5
-        # COLMAP's 1.1 adjusts the whole model per tenth of growth: half as much time again, equal errors.
-        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         self._report(phase="reconstructing", total=total)
         registered = count(3)  # after the first pair
 

@@ -8,6 +8,7 @@ of two keypoints it is then the distance from the epipolar line.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,14 +119,32 @@ def prediction_errors(tracks: Tracks, model: pycolmap.Reconstruction) -> ArrayF6
 def scales_differ(tracks: Tracks, model: pycolmap.Reconstruction, start: int) -> bool:
     """Return True if the images before id ``start`` and the others have different scales.
 
-    Tracks across this join get a point from each side alone. If the sides have different scales, the
-    distances of these points from the join's camera have another ratio than 1. True if its interval of 95 %
-    is farther from 1 than `MAX_SCALE`.
+    That is, if the interval of 95 % of `_scale_across` is farther from 0 than `MAX_SCALE`.
+    """
+    scale, error = _scale_across(tracks, model, start)
+    return abs(scale) - WITHIN * error > MAX_SCALE
+
+
+def scales_agree(tracks: Tracks, model: pycolmap.Reconstruction, start: int) -> bool:
+    """Return True if the images before id ``start`` and the others have the same scale.
+
+    That is, if the interval of 95 % of `_scale_across` is nearer to 0 than `MAX_SCALE`.
+    """
+    scale, error = _scale_across(tracks, model, start)
+    return abs(scale) + WITHIN * error <= MAX_SCALE
+
+
+def _scale_across(tracks: Tracks, model: pycolmap.Reconstruction, start: int) -> tuple[float, float]:
+    """Return the scale of the images from id ``start`` on over that before, and its standard error.
+
+    Both are logarithms. Tracks across this join get a point from each side alone. The scale is the median
+    ratio of the distances of these points from the join's camera. The error is infinite if there are fewer
+    than `MIN_TRACKS`.
     """
     placed = _placed(tracks, model)
     join = min((key for key, image in model.images.items() if image.has_pose and key >= start), default=None)
     if join is None:
-        return False
+        return 0.0, math.inf
     joint = model.images[join].projection_center()
     before, after = placed & (tracks.image < start), placed & (tracks.image >= start)
     across = np.isin(tracks.track, np.intersect1d(tracks.track[before], tracks.track[after]))
@@ -133,7 +152,7 @@ def scales_differ(tracks: Tracks, model: pycolmap.Reconstruction, start: int) ->
     for among in (before & across, after & across):
         used, number = _several(tracks, among)
         if not len(used):
-            return False
+            return 0.0, math.inf
         rays = _rays(tracks, used, model)
         points = rays.points(number)
         mean = np.add.reduceat(rays.directions, np.cumsum(np.bincount(number)) - np.bincount(number))
@@ -147,9 +166,8 @@ def scales_differ(tracks: Tracks, model: pycolmap.Reconstruction, start: int) ->
         found.append(dict(zip(names[good].tolist(), distance[good].tolist(), strict=True)))
     both = sorted(found[0].keys() & found[1].keys())
     if len(both) < MIN_TRACKS:
-        return False
+        return 0.0, math.inf
     ratios = np.array([found[1][key] - found[0][key] for key in both])
     middle = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(ratios - middle)))
-    error = 1.2533 * spread / np.sqrt(len(ratios))  # standard error of a median
-    return bool(abs(middle) - WITHIN * error > MAX_SCALE)
+    return middle, 1.2533 * spread / math.sqrt(len(ratios))  # standard error of a median

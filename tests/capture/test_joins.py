@@ -78,9 +78,22 @@ def test_a_join_is_checked_once_where_nothing_was_placed_in_between(
     """Every capture whose frames were all placed at first printed "checking a weak join" twice."""
     phases: list[str] = []
     monkeypatch.setattr(mapping, "_JOINED", 1.01)  # all joins are weak
+    monkeypatch.setattr(mapping, "scales_agree", lambda *_: False)
     placer._report = lambda **said: phases.append(said.get("phase", ""))
     placer.mapped(placer.pairs())
     assert phases.count("checking a weak join") == 1
+
+
+def test_a_weak_join_of_one_scale_is_not_mapped_again(
+    placer: mapping.Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wrong matches made the joins of `bonsai` weak, and half of its frames were mapped again for nothing."""
+    phases: list[str] = []
+    monkeypatch.setattr(mapping, "weakest_join", lambda *_: (5, 0.9))
+    placer._report = lambda **said: phases.append(said.get("phase", ""))
+    right = placer._map()
+    assert placer._rejoined(right, placer.database) is right
+    assert "checking a weak join" not in phases
 
 
 def test_a_part_at_another_scale_is_placed_again(placer: mapping.Mapper) -> None:

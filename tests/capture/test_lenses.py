@@ -21,7 +21,7 @@ from cleargs.capture.config import SfmConfig
 from cleargs.capture.frame_fit import halves_apart
 from cleargs.capture.kept_out import all_tracks
 from cleargs.capture.lenses import Fit, is_impossible, lens_owners
-from cleargs.capture.prediction import prediction_errors, scales_differ
+from cleargs.capture.prediction import Tracks, prediction_errors, scales_agree, scales_differ
 from cleargs.capture.sfm import contradictions
 from cleargs.capture.sfm_job import Prediction, SfmOutcome
 from cleargs.errors import StageError
@@ -300,7 +300,9 @@ def test_kept_out_keypoints_show_a_wrong_pose_and_another_scale(tmp_path: Path) 
     tracks = all_tracks(tmp_path / "matches.db")
     right = prediction_errors(tracks, model)
     assert len(right) > 1000 and np.nanmax(right) < 1e-3  # exact keypoints
-    assert not scales_differ(tracks, model, 5)
+    assert not scales_differ(tracks, model, 5) and scales_agree(tracks, model, 5)
+    few = Tracks(tracks.image[:30], tracks.track[:30], tracks.keypoint[:30], tracks.xy[:30])
+    assert not scales_agree(few, model, 5)  # too few tracks to say
 
     def with_second_half_scaled(factor: float) -> pycolmap.Reconstruction:
         other = pycolmap.Reconstruction(model)
@@ -316,5 +318,7 @@ def test_kept_out_keypoints_show_a_wrong_pose_and_another_scale(tmp_path: Path) 
     assert scales_differ(tracks, with_second_half_scaled(1.1), 5)
     assert scales_differ(tracks, with_second_half_scaled(1 / 1.1), 5)
     assert not scales_differ(tracks, with_second_half_scaled(1.005), 5)
+    assert scales_agree(tracks, with_second_half_scaled(1.005), 5)
+    assert not scales_agree(tracks, with_second_half_scaled(1.1), 5)
     wrong = prediction_errors(tracks, with_second_half_scaled(1.1))
     assert (wrong > 5.0).mean() > 0.25  # the smaller side of each track
