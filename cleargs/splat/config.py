@@ -13,7 +13,7 @@ from cleargs.plugins import require_known
 # of frames, Gaussians the number of pixels. `quality` scales both; docs/speed.md lists its cost and gain.
 Quality = Literal["draft", "standard", "high"]
 
-STEPS_PER_FRAME = 10
+STEPS_PER_FRAME = 40
 MIN_STEPS, MAX_STEPS = 2400, 3600
 STEPS_FACTOR: dict[Quality, float] = {"draft": 1 / 3, "standard": 1.0, "high": 6.0}
 
@@ -111,7 +111,7 @@ class TrainConfig(FrozenModel):
         None,
         ge=1,
         le=1_000_000,
-        description="optimisation steps, one view each; unset = 10 per active frame, 2,400 to 3,600, times "
+        description="optimisation steps, one view each; unset = 40 per active frame, 2,400 to 3,600, times "
         "the factor of the quality",
     )
     begin: float = Field(0.0, ge=0, lt=1, description="start of this training in the schedule, as a fraction")
