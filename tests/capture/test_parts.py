@@ -112,6 +112,18 @@ def test_a_pinhole_is_not_resampled() -> None:
     assert half.pinhole == pinhole(160, 120, 150, 150, 75, 65)
 
 
+def test_an_image_that_is_hardly_reduced_keeps_its_detail() -> None:
+    # Barrel distortion: the flat image is 804 px wide, and is published with 800 px. Stripes of 4 px per
+    # period would lose a third of their contrast where a second resampling averages two neighbours.
+    lens = Intrinsics("SIMPLE_RADIAL", 800, 600, (800.0, 400.0, 300.0, -0.02))
+    x = np.broadcast_to(np.arange(800) + 0.5, (600, 800))
+    stripes = (127.5 + 100 * np.sin(0.5 * np.pi * x)).round().astype(np.uint8)
+    flat = undistorter(lens, 800).image(np.stack([stripes] * 3, axis=-1))[..., 0].astype(float)
+    assert flat.shape[1] == 800
+    contrast = np.array([flat[:, start : start + 40].std() for start in range(0, 800, 40)])
+    assert contrast.min() > 0.85 * 100 / np.sqrt(2)
+
+
 @given(st.floats(0.1, 3), st.floats(-1, 1), st.integers(0, 2**31))
 @settings(max_examples=30)
 def test_normalised_world(scale: float, tilt: float, seed: int) -> None:
