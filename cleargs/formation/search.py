@@ -85,7 +85,9 @@ def search(
             straight = _best(level, [nearer], model, steps, pose)
             best = _promising(level, [straight, curved], no_motion) if BLUR in _ACTIVE[model] else None
             if best is not None and level is not levels[-1]:
-                curved = _best(level, [best], model, steps, pose, MAX_ORDER)
+                # At a blur of 0 all derivatives of a path are 0, and a straight path may have ended there.
+                others = starts[:1] if level is coarse else []
+                curved = _best(level, [best, *others], model, steps, pose, MAX_ORDER)
         found.append((model, straight))
         if best is not None and (straight.blur.any() or curved.blur.any()):
             paths = [_best(level, [straight], model, steps, pose, 2)]

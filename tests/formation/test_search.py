@@ -29,7 +29,9 @@ from scipy.ndimage import map_coordinates
 from cleargs.formation import comparison
 from cleargs.formation.comparison import FramePair
 from cleargs.formation.motion import TWIST, FrameMotion, Model, flow_basis
-from cleargs.formation.search import preferred, refine, search
+from cleargs.formation.pretest import missing_blur
+from cleargs.formation.search import blur_along, preferred, refine, search
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.backend import set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import backend as cpu
@@ -118,6 +120,24 @@ def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model)
     apart = [torch.hypot(*(ours.sweep - sign * theirs.sweep)).mean() for sign in (1, -1)]
     assert min(apart) < 1.0
     assert (ours.radius - theirs.radius).abs().mean() < 0.7
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.0])
+def test_a_frame_that_shows_the_scene_twice_is_explained(truth: Image, angle: float) -> None:
+    """The camera rests, jumps and rests again. No straight path explains that better than none does."""
+    jump = twist(0, 0, 0, 10 * np.cos(angle), 10 * np.sin(angle), 0)
+    between = FrameMotion(pose=jump / 2, blur=jump, median_depth=MEDIAN)
+    path = {FrameMotion(): 0.7, between: 0.1, FrameMotion(pose=jump, median_depth=MEDIAN): 0.2}
+    light = sum(share * linear_from_srgb(observe(truth, part, noise=0.0)) for part, share in path.items())
+    grain = np.random.default_rng(0).standard_normal(truth.shape) / 255
+    filmed = np.clip(srgb_from_linear(np.asarray(light)) + grain, 0, 1).astype(np.float32)
+    pair = frame_pair(soft(truth), filmed)
+    missing = missing_blur(pair.luminance, pair.observed, pair.weight)
+    start = blur_along(missing.length, missing.angle)
+    found = search(pair, start=start, skew=False, defocus=False, pose=True)
+    straight = [fit for fit in found if fit.model == "blur" and fit.motion.order == 1]
+    assert max(fit.explained for fit in straight) < 0.02
+    assert preferred(found).explained > 0.15 and preferred(found).motion.order == 3
 
 
 def test_a_sharp_frame_is_left_alone(truth: Image) -> None:
