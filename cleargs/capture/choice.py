@@ -16,7 +16,6 @@ from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.layouts.video import video_frame
 from cleargs.capture.pace import Pace, even_places
 from cleargs.errors import InputError
-from cleargs.media.image import reduced
 from cleargs.media.video import decode_grey, read_timeline
 from cleargs.progress import Reporter
 from cleargs.types import ImageU8
@@ -59,8 +58,7 @@ def _sharpest_of(
     every = max(1, round(_FOLLOWED_S / max(between, 1e-6)))
     numbers = {pts: number for number, pts in enumerate(timeline.pts)}
     with reporter.task("looking for sharp frames", len(numbers)) as task:
-        for pts, grey in decode_grey(video, numbers):
-            picture = reduced(grey, long_side)
+        for pts, picture in decode_grey(video, numbers, long_side):
             values[numbers[pts]] = sharpness(picture)
             if by_motion and (not followed or numbers[pts] >= followed[-1] + every):
                 followed.append(numbers[pts])
