@@ -20,7 +20,7 @@ from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
-from cleargs.types import ArrayF32, ArrayF64
+from cleargs.types import ArrayF32, ArrayF64, MaskBool
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
@@ -140,6 +140,7 @@ class Level:
         self._fitting, self._holdout = counted * fitting, counted * holdout
         if not self._holdout.any():  # an image of a few blocks
             self._holdout = self._fitting = counted
+        self._fitting_rows, self._every_row = self._fitting.any(axis=1), np.ones(len(counted), np.bool_)
         self._total = max(float(self._holdout.sum(dtype=np.float64)), 1.0)
         # A copy, because the pair and its finest level would keep each other in memory.
         self._pair, self._reduced = replace(pair), reduced
@@ -185,13 +186,14 @@ class Level:
         return np.asarray(cv2.GaussianBlur(self._image, (3, 3), 0.0), np.float32)
 
     @cached_property
-    def _nowhere(self) -> ArrayF32:
-        return np.zeros((2, *self._image.shape), np.float32)
+    def _nowhere(self) -> ArrayF32:  # [H, W]
+        return np.zeros_like(self._image)
 
     @cached_property
     def _still(self) -> float:
         """Residual without any motion."""
-        fields = self._nowhere, self._nowhere, self._nowhere[0], None
+        nowhere = np.zeros((2, *self._image.shape), np.float32)
+        fields = nowhere, nowhere, self._nowhere, None
         total = cpu.residual(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
         return total / self._total
 
@@ -200,34 +202,34 @@ class Level:
         residual = self._still
         if model != "none":
             times = DISC if model == "defocus" else FINE
-            residual = self._residual(motion, times, self._holdout) / self._total
+            residual = self._residual(motion, times, self._holdout, self._every_row) / self._total
         return MotionFit(model, motion, residual, self._still)
 
     def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:
         """Return the sum of the differences on the pixels that are not held out."""
-        return self._residual(motion, times, self._fitting)
+        return self._residual(motion, times, self._fitting, self._fitting_rows)
 
-    def _residual(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
-        fields = self.fields(motion, curved=motion.order > 1)
+    def _residual(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32, rows: MaskBool) -> float:
+        fields = self._fields(motion, motion.order > 1, rows)
         return cpu.residual(self._image, self._observed, weight, fields, times, LIMIT)
 
-    def fields(
-        self, motion: FrameMotion, curved: bool
+    def _fields(
+        self, motion: FrameMotion, curved: bool, rows: MaskBool
     ) -> tuple[ArrayF32, ArrayF32, ArrayF32, ArrayF32 | None]:
-        """Return offset, sweep, radius and, where ``curved``, curve: see `DisplacementFields`."""
+        """Return offset, sweep, radius and, where ``curved``, curve: see `DisplacementFields`.
 
-        def flow(twist: ArrayF64) -> ArrayF32:
-            return cpu.flow(self._basis, twist) if twist.any() else self._nowhere
-
-        offset = flow(motion.pose)
+        Those of a motion are only computed in ``rows`` [H].
+        """
+        twists = [motion.pose, motion.blur, *([motion.bend, motion.cube] if curved else [])]
+        flows = cpu.flows(self._basis, np.stack(twists), rows)
+        offset, sweep = flows[:2]
         if motion.skew.any():
-            offset = offset + self._read(motion)
-        radius = self._nowhere[0]
+            offset += self._read(motion)
+        radius = self._nowhere
         if motion.disc_px > 0.0:
             disc = np.float32(motion.disc_px * self.scale)
             radius = np.abs(self.nearness - np.float32(motion.focus)) * disc
-        curve = np.concatenate([flow(motion.bend), flow(motion.cube)]) if curved else None
-        return offset, flow(motion.blur), radius, curve
+        return offset, sweep, radius, flows[2:].reshape(4, *radius.shape) if curved else None
 
     def _read(self, motion: FrameMotion) -> ArrayF32:
         """Return the displacements [2, H, W] by the rolling shutter alone. Those of the last one are kept."""
@@ -253,7 +255,7 @@ class Level:
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:
         """Return matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
         curved = bool((active >= BEND.start).any()) or motion.order > 1
-        offset, sweep, _, curve = self.fields(motion, curved)
+        offset, sweep, _, curve = self._fields(motion, curved, self._fitting_rows)
         return cpu.normal_equations(
             self._image,
             self._smooth,

@@ -265,11 +265,13 @@ def read_displacements(
     return out
 
 
-def flow(basis: ArrayF32, twist: npt.NDArray[np.float64]) -> ArrayF32:
-    """Return the image motion [2, H, W], px, of a ``twist`` [6]: see `frame_search.flow`."""
-    out = np.empty(basis.shape[1:], np.float32)
+def flows(
+    basis: ArrayF32, twists: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_]
+) -> ArrayF32:  # [T, 2, H, W]
+    """Return the image motion, px, of each of the ``twists`` [T, 6] in the rows ``asked`` [H], elsewhere 0."""
+    out = np.empty((len(twists), *basis.shape[1:]), np.float32)
     with LAUNCHING:
-        frame_search.flow(basis, twist.astype(np.float32), out)
+        frame_search.flows(basis, twists.astype(np.float32), asked, out)
     return out
 
 
@@ -392,5 +394,5 @@ def _warm_up_formation() -> None:
             *(np.zeros((6, 2, SIZE, SIZE), np.float32), np.zeros(SIZE, np.float32), offset, sweep),
             *(curve, np.zeros(1, np.float32), 1.0, np.arange(6)),
         )
-    flow(np.zeros((6, 2, SIZE, SIZE), np.float32), np.zeros(6))
+    flows(np.zeros((6, 2, SIZE, SIZE), np.float32), np.zeros((1, 6)), np.ones(SIZE, np.bool_))
     blur_sums(pixels, pixels, pixels, 2, 4)

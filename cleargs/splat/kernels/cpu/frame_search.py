@@ -26,20 +26,26 @@ def _mixed(plane: Any, i: Any, j: Any, a: Any, b: Any) -> Any:
 
 
 @kernel
-def flow(
+def flows(
     basis: ArrayF32,  # [6, 2, H, W]: image motion per component of a twist, px
-    twist: ArrayF32,  # [6]
-    out: ArrayF32,  # [2, H, W], written
+    twists: ArrayF32,  # [T, 6]
+    asked: AnyArray,  # [H] bool: rows that are needed; the others are 0
+    out: ArrayF32,  # [T, 2, H, W], written
 ) -> None:
-    """Write the image motion of a twist, px."""
+    """Write the image motion of each twist, px."""
     _, _, height, width = basis.shape
     for y in prange(height):
         for axis in range(2):
-            for x in range(width):
-                total = np.float32(0)
-                for n in range(6):
-                    total += twist[n] * basis[n, axis, y, x]
-                out[axis, y, x] = total
+            for t in range(len(twists)):  # a row of the basis stays in the cache
+                if asked[y]:
+                    for x in range(width):
+                        total = np.float32(0)
+                        for n in range(6):
+                            total += twists[t, n] * basis[n, axis, y, x]
+                        out[t, axis, y, x] = total
+                else:
+                    for x in range(width):
+                        out[t, axis, y, x] = np.float32(0)
 
 
 @kernel
