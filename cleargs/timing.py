@@ -22,7 +22,7 @@ class PartTime(FrozenModel):
     """Name of the part, after those of the parts that hold it."""
     seconds: float
     cpu_seconds: float
-    """Processor time of all threads and of child processes that ended."""
+    """Processor time of all threads and of child processes."""
     times: int
     """Number of times that the part was done."""
 
@@ -81,7 +81,17 @@ def recorded() -> Iterator[Part]:
         _current.reset(token)
 
 
+_running = 0.0
+"""Processor time of the child process that runs, by its last report, s."""
+
+
+def child_used(seconds: float) -> None:
+    """Count the processor time, s, that a running child process reports; 0 once it has ended."""
+    global _running
+    _running = seconds
+
+
 def cpu_seconds() -> float:
-    """Return the processor time of this process and of its ended children, s."""
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + children.ru_utime + children.ru_stime
+    """Return the processor time of this process and of its children, s."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + ended.ru_utime + ended.ru_stime + _running

@@ -1,9 +1,10 @@
 """Work in a child process that reports progress, can be killed, and may abort without ending this process.
 
 The child writes JSON objects, one per line, to its standard output. ``{"phase": label, "total": n}`` opens a
-phase, ``{"done": k}`` advances it, ``{"error": cause, "hint": remedy}`` reports a failure. Its standard error
-(COLMAP's log) goes to a file. The child and its own children end with the parent: the child watches its
-standard input, whose other end closes when the parent ends for any reason.
+phase, ``{"done": k}`` advances it, ``{"error": cause, "hint": remedy}`` reports a failure. Each also has
+``cpu``, the processor time so far. The child's standard error (COLMAP's log) goes to a file. It and its own
+children end with the parent: the child watches its standard input, whose other end closes when the parent
+ends for any reason.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from cleargs.errors import StageError, StoreError
 from cleargs.files import disk_error
 from cleargs.progress import Reporter, Task
 from cleargs.subprocesses import module_command
+from cleargs.timing import child_used, cpu_seconds
 
 _FULL = 8 * 2**20  # a disk with fewer free bytes counts as full: SQLite writes blocks of up to some MB
 
@@ -38,7 +40,7 @@ def reports_to_parent() -> Callable[..., None]:
     reports = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    return lambda **message: print(json.dumps(message), file=reports)
+    return lambda **message: print(json.dumps({**message, "cpu": cpu_seconds()}), file=reports)
 
 
 def _die_with_parent() -> None:
@@ -73,6 +75,7 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
             failure = _follow(child, reporter)
             status = child.wait()
         finally:
+            child_used(0.0)
             with suppress(OSError):  # the processes have ended
                 os.killpg(child.pid, signal.SIGKILL)
     # On a full disk, COLMAP and SQLite fail with unrelated messages.
@@ -118,6 +121,7 @@ def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | No
         task: Task | None = None
         for line in child.stdout:
             message = json.loads(line)
+            child_used(message["cpu"])
             if "phase" in message:
                 phases.close()
                 task = phases.enter_context(reporter.task(message["phase"], message["total"]))

@@ -9,6 +9,8 @@ import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,8 @@ import pytest
 from cleargs.capture import child
 from cleargs.capture.child import run_child
 from cleargs.errors import StageError, StoreError
-from cleargs.progress import SilentReporter
+from cleargs.progress import SilentReporter, Task
+from cleargs.timing import recorded, timed
 
 PREAMBLE = """
 import os, sys, time
@@ -55,6 +58,28 @@ def test_a_named_error_arrives(module: Path) -> None:
     with pytest.raises(StageError, match="why") as caught:
         run(module)
     assert caught.value.hint == "what"
+
+
+def test_processor_time_counts_for_the_phase_that_used_it(module: Path) -> None:
+    """Not for the work around the child, which waits for its end."""
+
+    class Timed(SilentReporter):
+        @contextmanager
+        def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+            with timed(label), super().task(label, total) as task:
+                yield task
+
+    busy = "while time.process_time() - begun < 0.5: pass\n"
+    module.write_text(
+        PREAMBLE
+        + "report(phase='busy', total=None)\nbegun = time.process_time()\n"
+        + busy
+        + "report(phase='idle', total=None)\ntime.sleep(0.1)\n"
+    )
+    with recorded() as times:
+        run_child(module.stem, module.with_suffix(".json"), module.with_suffix(".log"), Timed())
+    rows = {row.part[0]: row.cpu_seconds for row in times.rows()}
+    assert rows["busy"] >= 0.5 > rows["idle"]
 
 
 def test_prints_do_not_disturb_the_reports(module: Path) -> None:

@@ -268,7 +268,7 @@ def read_displacements(
 def flows(
     basis: ArrayF32, twists: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_]
 ) -> ArrayF32:  # [T, 2, H, W]
-    """Return the image motion, px, of each of the ``twists`` [T, 6] in the rows ``asked`` [H], elsewhere 0."""
+    """Return the image motion, px, of each twist [T, 6]. Rows that are not ``asked`` [H] for are 0."""
     out = np.empty((len(twists), *basis.shape[1:]), np.float32)
     with LAUNCHING:
         frame_search.flows(basis, twists.astype(np.float32), asked, out)
