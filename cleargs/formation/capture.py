@@ -9,6 +9,8 @@ refines the motion with the current scene. All models are searched from scratch 
 | 4th, 8th, 16th, ... after it | tried | if the path is curved or the shutter rolls |
 | any | - | if `pretest` (a few milliseconds) finds blur that the model does not explain |
 
+A frame that follows its measured motion is estimated half as often (`MEASURED_EVERY`).
+
 `pretest` cannot see a skew: while a rolling shutter is possible, frames are searched for it. Later trainings
 continue with formations and numbers of estimates. They keep the formation of a frame after
 `ESTIMATES_TO_KEEP` estimates.
@@ -60,6 +62,8 @@ next search. It doubles from one try to the next, because the scene changes less
 ESTIMATES_TO_KEEP = 7
 """Estimates of a frame's formation after which later trainings keep it. Scenes lost nothing after 7 and 15,
 and up to 0.2 dB after 3 (docs/experiments/formation.md)."""
+MEASURED_EVERY = 2
+"""Factor on ``every`` for frames that follow their measured motion (docs/experiments/formation.md)."""
 CLEAR_BLUR, EXPOSED_FRAMES, MIN_EXPOSED_FRAMES = 3.0, 9, 3
 """Blur, px, that shows the exposure time of its frame; largest and smallest number of frames around a frame
 from which its exposure time is known."""
@@ -220,7 +224,7 @@ class CaptureFormation:
             pose=frame_id in self._posed,
             low_weight=self._weights[frame_id] < LOW_WEIGHT,
             shutter="rolling" if self._rolls(frame_id) else tested,
-            curve=_tries_higher_order(frame.steps // self._config.every),
+            curve=_tries_higher_order(frame.steps // self._every(frame_id)),
             only_if_blur_found=not self._config.first_search or self._sharp(),
             exposure_s=self._exposure(frame_id),
             measured=self._measured.get(frame_id),
@@ -303,7 +307,12 @@ class CaptureFormation:
     def _due(self, frame_id: int) -> bool:
         """Return True if the formation of a frame is estimated before the next step on it."""
         steps = self._frames[frame_id].steps
-        return steps == 0 or (steps % self._config.every == 0 and frame_id not in self._kept)
+        return steps == 0 or (steps % self._every(frame_id) == 0 and frame_id not in self._kept)
+
+    def _every(self, frame_id: int) -> int:
+        """Return the number of steps on a frame between two estimates."""
+        follows = frame_id in self._measured and not self._frames[frame_id].searched
+        return self._config.every * (MEASURED_EVERY if follows else 1)
 
     def _all_estimated(self, frame_id: int) -> bool:
         """Return True if an estimate of this frame completes a round of estimates of all frames."""

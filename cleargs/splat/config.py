@@ -58,7 +58,10 @@ class FormationConfig(FrozenModel):
         0.25, ge=0, le=1, description="fraction of the schedule before image formation is first estimated"
     )
     every: int = Field(
-        10, ge=1, description="training steps on a frame between two estimates of its image formation"
+        10,
+        ge=1,
+        description="training steps on a frame between two estimates of its image formation; twice as many "
+        "if it follows the motion that ingest measured",
     )
     first_search: bool = Field(
         True,

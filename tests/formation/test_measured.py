@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from cleargs.formation import estimate
-from cleargs.formation.capture import CaptureFormation
+from cleargs.formation import capture, estimate
+from cleargs.formation.capture import MEASURED_EVERY, CaptureFormation
 from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
 from cleargs.formation.measured import MeasuredPath, load_paths
@@ -65,6 +68,24 @@ def test_a_measured_blur_needs_no_search(
     truth = blurred().motion.blur
     assert np.linalg.norm(found[BLURRED].motion.blur - truth) < 0.15 * np.linalg.norm(truth)
     assert found[BLURRED].explained > 0.5
+
+
+def test_a_frame_that_follows_its_measured_motion_is_estimated_half_as_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimates: Counter[int] = Counter()
+
+    def counted(frame: FrameFormation, *others: Any) -> FrameFormation:
+        estimates[frame.frame_id] += 1
+        return estimate.fit_motion(frame, *others)
+
+    monkeypatch.setattr(capture, "fit_motion", counted)
+    seen = filmed({BLURRED: blurred()})
+    formation = CaptureFormation(seen, LOOK, measured={k: measured() for k in range(1, FRAMES)})
+    run(tmp_path, seen, formation)
+    for frame_id, frame in formation.frames.items():
+        every = LOOK.every * (MEASURED_EVERY if frame_id > 0 else 1)
+        assert estimates[frame_id] == math.ceil(frame.steps / every) > 1, frame_id
 
 
 def test_a_wrong_measurement_is_left_for_a_search(tmp_path: Path) -> None:
