@@ -260,8 +260,9 @@ def summary_table(listed: RealList, found: RealResults) -> str:
     made = ". ".join(f"{', '.join(names)}: {origin}" for origin, names in origins.items())
     line = (
         "PSNR in dB / LPIPS (AlexNet) on held-out frames, at equal steps and Gaussians. If the motion of the "
-        "camera was measured, the scene of ClearGS is compared as the camera took the frames. ± is "
-        f"half the 95 % interval of the difference over the trainings; bold excludes zero. {made}."
+        "camera was measured, the scene of ClearGS is compared as the camera took the frames. ± is the "
+        "standard deviation over the trainings, and in the differences half their 95 % interval; bold "
+        f"excludes zero. {made}."
     )
     if absent:
         line += f" Still to be measured: {', '.join(absent)}."
@@ -296,23 +297,23 @@ def _origins(stored: Mapping[str, Trainings]) -> str:
     return "; ".join(f"{', '.join(labels)}: {origin}" for origin, labels in origins.items())
 
 
+def _text(spread: Spread | None, digits: int) -> str:
+    """Return a mean, and the standard deviation over the trainings if there are several."""
+    if spread is None:
+        return "-"
+    more = f" ± {spread.deviation:.{digits}f}" if spread.deviation is not None else ""
+    return f"{spread.mean:.{digits}f}{more}"
+
+
 def _short(cells: Cells, column: str, variant: str) -> str:
     psnr, lpips = (cells.spread("held-out", column, variant, name) for name in REFINED)
-    if psnr is None:
-        return "-"
-    return f"{psnr.mean:.2f}" if lpips is None else f"{psnr.mean:.2f} / {lpips.mean:.3f}"
+    return _text(psnr, 2) if lpips is None else f"{_text(psnr, 2)} / {_text(lpips, 3)}"
 
 
 def _figures(cells: Cells, column: str, variant: str) -> list[str]:
-    def text(spread: Spread | None, digits: int) -> str:
-        if spread is None:
-            return "-"
-        more = f" ± {spread.deviation:.{digits}f}" if spread.deviation is not None else ""
-        return f"{spread.mean:.{digits}f}{more}"
-
     metrics = (("psnr", 2), ("ssim", 3), ("lpips_alex", 3), *zip(REFINED.values(), (2, 3), strict=True))
     return [
-        *(text(cells.spread("held-out", column, variant, metric), digits) for metric, digits in metrics),
+        *(_text(cells.spread("held-out", column, variant, metric), digits) for metric, digits in metrics),
         _minutes(cells.of("held-out", column, variant)),
     ]
 
