@@ -56,7 +56,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
 FEW_FRAMES, GOOD_FRAMES = 20, 30
 """Number of frames below which a warning is given, and the number that it asks for."""
 
-VERSION = 35
+VERSION = 36
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}

@@ -129,6 +129,8 @@ def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | No
                 failure = StageError(message["error"], hint=message["hint"])
             elif task is not None:
                 task.update(done=message["done"])
+        child.wait()  # its time since the last report belongs to the last phase
+        child_used(0.0)
     return failure
 
 

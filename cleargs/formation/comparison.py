@@ -193,7 +193,7 @@ class Level:
     def _still(self) -> float:
         """Residual without any motion."""
         nowhere = np.zeros((2, *self._image.shape), np.float32)
-        fields = nowhere, nowhere, self._nowhere, None
+        fields = nowhere, nowhere, nowhere[0], None
         total = cpu.residual(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
         return total / self._total
 

@@ -69,17 +69,17 @@ def test_processor_time_counts_for_the_phase_that_used_it(module: Path) -> None:
             with timed(label), super().task(label, total) as task:
                 yield task
 
-    busy = "while time.process_time() - begun < 0.5: pass\n"
+    busy = "begun = time.process_time()\nwhile time.process_time() - begun < 0.5: pass\n"
     module.write_text(
         PREAMBLE
-        + "report(phase='busy', total=None)\nbegun = time.process_time()\n"
-        + busy
+        + f"report(phase='busy', total=None)\n{busy}"
         + "report(phase='idle', total=None)\ntime.sleep(0.1)\n"
+        + f"report(phase='last', total=None)\n{busy}"
     )
     with recorded() as times:
         run_child(module.stem, module.with_suffix(".json"), module.with_suffix(".log"), Timed())
     rows = {row.part[0]: row.cpu_seconds for row in times.rows()}
-    assert rows["busy"] >= 0.5 > rows["idle"]
+    assert rows["busy"] >= 0.5 > rows["idle"] and rows["last"] >= 0.5
 
 
 def test_prints_do_not_disturb_the_reports(module: Path) -> None:

@@ -17,6 +17,7 @@ from cleargs.errors import InputError
 from cleargs.media import video
 from cleargs.media.colour import KNEE, LUMA, linear_from_srgb, srgb_from_hdr, srgb_from_linear, tone_map
 from cleargs.media.encode import write_video
+from cleargs.media.image import reduced
 from cleargs.media.video import decode_frames, decode_grey, read_timeline
 
 # EBU bars at 75 %, with greys and a saturated red, in sRGB code values.
@@ -402,3 +403,14 @@ def test_a_fifo_is_no_video(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "v.mp4")
     with pytest.raises(InputError, match="not a regular file"):
         read_timeline(tmp_path / "v.mp4")
+
+
+def test_a_grey_frame_is_reduced_like_a_picture(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mkv"
+    encode(path, bar_planes("bt709", False))
+    stamps = read_timeline(path).pts[:1]
+    (_, whole), (_, small) = next(decode_grey(path, stamps)), next(decode_grey(path, stamps, 16))
+    expected = reduced(whole, 16)
+    assert small.shape == expected.shape and max(small.shape) == 16
+    assert np.corrcoef(small.ravel(), expected.ravel())[0, 1] > 0.99  # FFmpeg's weights differ at edges
+    assert np.array_equal(next(decode_grey(path, stamps, 4 * max(whole.shape)))[1], whole)
