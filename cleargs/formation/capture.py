@@ -112,8 +112,8 @@ class CaptureFormation:
         judged = sum(frame_id in self._measured for frame_id in real)
         self._readout_found = any(path.rolls for path in self._measured.values())
         self._shutter_measured = judged >= max(MIN_TIMED_FRAMES, MEASURED_SHARE * len(real))
-        enough = (ESTIMATES_TO_KEEP - 1) * config.every
-        self._kept = {frame_id for frame_id, frame in self._frames.items() if frame.steps > enough}
+        last = ESTIMATES_TO_KEEP - 1
+        self._kept = {k for k, frame in self._frames.items() if frame.steps > last * self._every(k)}
         self._tested = {real[k] for k in frames_to_test(len(real))}
         self._weights = {view.frame_id: view.weight for view in filmed}
         self._speeds = CameraSpeeds.of(filmed)

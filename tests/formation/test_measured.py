@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from cleargs.formation import capture, estimate
-from cleargs.formation.capture import MEASURED_EVERY, CaptureFormation
+from cleargs.formation.capture import ESTIMATES_TO_KEEP, MEASURED_EVERY, CaptureFormation
 from cleargs.formation.formed import render_formed
 from cleargs.formation.frame import FrameFormation, filmed_as, packed, unpacked
 from cleargs.formation.measured import MeasuredPath, load_paths
@@ -86,6 +86,24 @@ def test_a_frame_that_follows_its_measured_motion_is_estimated_half_as_often(
     for frame_id, frame in formation.frames.items():
         every = LOOK.every * (MEASURED_EVERY if frame_id > 0 else 1)
         assert estimates[frame_id] == math.ceil(frame.steps / every) > 1, frame_id
+
+
+def test_a_later_training_counts_estimates_and_not_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After equal steps, a frame that follows its measured motion has had half of the estimates."""
+    looked: set[int] = set()
+
+    def look(frame: FrameFormation, *_: Any) -> FrameFormation:
+        looked.add(frame.frame_id)
+        return frame
+
+    monkeypatch.setattr(capture, "fit_motion", look)
+    steps = (ESTIMATES_TO_KEEP + 1) * LOOK.every
+    known = {k: FrameFormation(k, steps=steps) for k in range(FRAMES)}
+    seen = filmed({})
+    run(tmp_path, seen, CaptureFormation(seen, LOOK, known=known, measured={1: measured()}))
+    assert looked == {1}
 
 
 def test_a_wrong_measurement_is_left_for_a_search(tmp_path: Path) -> None:
