@@ -21,6 +21,9 @@ from cleargs.progress import Reporter
 from cleargs.types import ImageU8
 
 _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
+_REACH, _BAND = 3, 64
+"""Reach of both filters of `sharpness`, and the number of rows that are filtered at once. Such bands stay in
+the cache of a core: they take a fifth of the time of a whole picture of 960x720."""
 _FOLLOWED_S = 0.1
 """Time between the frames of a video in which the motion of the picture is followed."""
 
@@ -90,11 +93,17 @@ def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
     noise would rank first. All values are whole numbers below 2^24, so the sums are exact.
     """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    smooth = cv2.sepFilter2D(grey, cv2.CV_32F, _BINOMIAL, _BINOMIAL)
-    laplacian = np.asarray(cv2.Laplacian(smooth, cv2.CV_32F)).astype(np.int64)
-    count = laplacian.size
+    total = squares = 0
+    for top in range(0, len(grey), _BAND):
+        before = min(top, _REACH)
+        band = grey[top - before : top + _BAND + _REACH]
+        smooth = cv2.sepFilter2D(band, cv2.CV_32F, _BINOMIAL, _BINOMIAL)
+        laplacian = np.asarray(cv2.Laplacian(smooth, cv2.CV_32F))[before : before + _BAND].astype(np.int64)
+        total += int(laplacian.sum())
+        squares += int((laplacian**2).sum())
+    count = grey.size
     # The filter's weights sum to 256.
-    return float(count * int((laplacian**2).sum()) - int(laplacian.sum()) ** 2) / count**2 / 256**2
+    return float(count * squares - total**2) / count**2 / 256**2
 
 
 def held_out(

@@ -293,6 +293,14 @@ def test_holdout_rules() -> None:
         held_out("every:2", names, read, [index == 0 for index in range(12)])
 
 
+@pytest.mark.parametrize("height", [2, 63, 64, 65, 67, 130])
+def test_sharpness_of_bands_is_that_of_the_whole_picture(height: int) -> None:
+    grey = np.random.default_rng(height).integers(0, 256, (height, 50), dtype=np.uint8)
+    binomial = np.array([1, 4, 6, 4, 1], np.float32)
+    laplacian = cv2.Laplacian(cv2.sepFilter2D(grey, cv2.CV_32F, binomial, binomial), cv2.CV_32F)
+    assert sharpness(grey) == pytest.approx(laplacian.astype(np.float64).var() / 256**2, rel=1e-12)
+
+
 def test_sharpness_is_not_noise() -> None:
     picture = cv2.resize(texture(0, 256), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     blurred = [cv2.GaussianBlur(picture, (0, 0), sigma) for sigma in (1.0, 2.0, 4.0)]
