@@ -16,6 +16,7 @@ from cleargs.evaluate import metrics
 from cleargs.evaluate.eval_report import Refinement
 from cleargs.evaluate.reference_views import ReferenceView
 from cleargs.evaluate.refinement import refine_pose
+from cleargs.formation.capture import MIN_EXPOSED_FRAMES
 from cleargs.formation.formed import FormedView
 from cleargs.formation.frame import filmed_as
 from cleargs.media.exr import read_depth
@@ -49,10 +50,14 @@ Predict = Callable[[ReferenceView, ImageU8, MaskBool | None], Prediction]
 
 
 def exposure_of(folder: Path) -> float:
-    """Return the median exposure time, s, that a training found with measured motions; 0 if it is unknown."""
+    """Return the median exposure time, s, that a training found with measured motions; 0 if it is unknown.
+
+    As in the training, fewer than `MIN_EXPOSED_FRAMES` frames do not show it: one frame of 52 sharp ones that
+    got a blur by chance would blur all renders.
+    """
     rows = SceneFolder(folder).formation_rows().values()
     times = [row["exposure_s"] for row in rows if row.get("exposure_s")]
-    return median(times) if times else 0.0
+    return median(times) if len(times) >= MIN_EXPOSED_FRAMES else 0.0
 
 
 def renderer(scene: Scene, refine_steps: int, points: ArrayF64 | None, exposure_s: float = 0.0) -> Predict:

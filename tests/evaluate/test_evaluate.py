@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -42,6 +43,7 @@ from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_hash, write_report
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
+from cleargs.evaluate.predictions import exposure_of
 from cleargs.evaluate.references import Reference, reference_of
 from cleargs.formation.measured import MeasuredPath
 from cleargs.formation.motion import readout_of
@@ -174,6 +176,16 @@ def test_a_frame_is_also_compared_as_its_camera_took_it(tmp_path: Path) -> None:
     )
     before, after = off.formed["psnr"], refined.formed["psnr"]
     assert before is not None and after is not None and after > before + 15.0  # observed: 71 dB after
+
+
+def test_the_exposure_time_is_that_of_several_frames(tmp_path: Path) -> None:
+    def found(*times: float) -> float:
+        rows = {"frame_id": list(range(9)), "exposure_s": [*times, *[0.0] * (9 - len(times))]}
+        pq.write_table(pa.table(rows), tmp_path / "formation.parquet")
+        return exposure_of(tmp_path)
+
+    assert found() == found(0.1) == found(0.1, 0.1) == 0.0
+    assert found(0.01, 0.03, 0.02) == 0.02
 
 
 def test_a_library_without_a_distribution_is_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
