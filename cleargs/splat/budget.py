@@ -37,10 +37,10 @@ def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: 
     """Estimate the wall seconds of each step on two idle cores, [length].
 
     Later steps take longer, as the number of Gaussians grows from ``start``. ``megapixels`` are per frame.
-    Steps and budget of ``config`` must be set (`resolve_config`).
+    No number that `resolve_config` sets may be unset in ``config``.
     """
     step = config.first + np.arange(config.length)
-    reduced = np.where(step < config.coarse_share * config.planned, config.coarse_factor**2, 1.0)
+    reduced = np.where(step < config.coarse_steps, config.coarse_factor**2, 1.0)
     seconds = STEP_S + STEP_S_PER_MEGAPIXEL * megapixels * reduced
     seconds += STEP_S_PER_GAUSSIAN * gaussians_by_step(config, start)
     if config.formation.enabled:
@@ -60,7 +60,7 @@ class TrainingCost(NamedTuple):
 def training_cost(config: TrainConfig, frames: int, megapixels: float, start: int) -> TrainingCost:
     """Estimate the cost of a training that begins with ``start`` Gaussians. ``megapixels`` are per frame.
 
-    Unset steps and budget are chosen as in `resolve_config`.
+    Numbers that are unset are chosen as in `resolve_config`.
     """
     whole = resolved(config, frames, round(frames * megapixels * 1e6))
     assert whole.budget is not None
@@ -82,11 +82,15 @@ def planned_start(config: Settings, points: int, at_least: int) -> tuple[Setting
 
 
 def resolve_config(config: Settings, views: Sequence[TrainingView]) -> Settings:
-    """Return ``config`` with steps and budget. Unset ones follow from the views (see `TrainConfig`)."""
+    """Return ``config`` with steps, budget and share of reduced images; unset ones follow from the views."""
     return resolved(config, len(views), sum(view.camera.width * view.camera.height for view in views))
 
 
 def resolved(config: Settings, frames: int, pixels: int) -> Settings:
-    """Return ``config`` with steps and budget for active frames with ``pixels`` pixels in total."""
-    update = {"steps": config.steps_for(frames), "budget": config.budget_for(pixels)}
+    """Return ``config`` with these three numbers for active frames with ``pixels`` pixels in total."""
+    update = {
+        "steps": config.steps_for(frames),
+        "budget": config.budget_for(pixels),
+        "coarse_share": config.coarse_share_for(pixels // max(1, frames)),
+    }
     return config.model_copy(update=update)

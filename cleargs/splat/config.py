@@ -24,6 +24,10 @@ BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.
 MCMC_NAME, OFF = "mcmc", "off"
 """Values of ``densify`` that need no other package."""
 
+COARSE_SHARE, DRAFT_COARSE_SHARE, DRAFT_COARSE_PIXELS = 0.25, 0.5, 200_000
+"""Share of the schedule with reduced images; the same in a draft with images of at least this many pixels.
+Smaller ones would lose detail, and a longer training gains nothing (docs/experiments/training.md)."""
+
 INIT_SCALE = 0.5
 """Initial scale of a Gaussian, relative to the distance of its neighbours (docs/experiments/training.md)."""
 INIT_OPACITY = 0.5
@@ -131,8 +135,12 @@ class TrainConfig(FrozenModel):
         description="weight of the term of the loss that compares texture, in the last 30 % of the schedule; "
         "0 = off",
     )
-    coarse_share: float = Field(
-        0.25, ge=0, le=1, description="fraction of the schedule, at its start, with reduced images; 0 = off"
+    coarse_share: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="fraction of the schedule, at its start, with reduced images; 0 = off; unset = 0.25, in "
+        "a draft of images of 200,000 pixels or more 0.5",
     )
 
     densify: str = Field(
@@ -225,6 +233,24 @@ class TrainConfig(FrozenModel):
     def budget_for(self, pixels: int) -> int:
         """Return the maximum number of Gaussians for active frames with ``pixels`` pixels in total."""
         return self.budget or budget_from_pixels(pixels, self.max_budget, self.quality)
+
+    def coarse_share_for(self, pixels: int) -> float:
+        """Return the share of the schedule with reduced images, for images of this mean number of pixels."""
+        if self.coarse_share is not None:
+            return self.coarse_share
+        large_draft = self.quality == "draft" and pixels >= DRAFT_COARSE_PIXELS
+        return DRAFT_COARSE_SHARE if large_draft else COARSE_SHARE
+
+    @property
+    def coarse_steps(self) -> float:
+        """Number of steps of the whole schedule with reduced images.
+
+        Raises:
+            ValueError: The share is unset; `cleargs.splat.budget.resolve_config` sets it.
+        """
+        if self.coarse_share is None:
+            raise ValueError("the share of reduced images is not set yet")
+        return self.coarse_share * self.planned
 
     @property
     def growth(self) -> float:

@@ -50,7 +50,7 @@ class Schedule:
 
     In all methods ``step`` is the number of finished steps of the whole schedule. Rates of means are in units
     of the normalised world, so they need no factor for the extent of the scene (Inria: ``spatial_lr_scale``).
-    ``config`` has a number of steps (`cleargs.splat.budget.resolve_config`).
+    ``config`` is one of `cleargs.splat.budget.resolve_config`.
     """
 
     def __init__(self, config: TrainConfig) -> None:
@@ -80,8 +80,7 @@ class Schedule:
 
     def image_factor(self, step: int) -> float:
         """Return the factor on width and height of the training images."""
-        config = self._config
-        return config.coarse_factor if step < config.coarse_share * config.planned else 1.0
+        return self._config.coarse_factor if step < self._config.coarse_steps else 1.0
 
     def sh_degree(self, step: int, largest: int) -> int:
         """Return the SH degree to render, at most the stored degree ``largest``."""

@@ -54,7 +54,7 @@ class Trainer:
         self,
         scene: Scene,  # to start from; it is copied
         views: Sequence[TrainingView],  # those with weight 0 are ignored
-        config: TrainConfig,  # unset steps and budget follow from the views
+        config: TrainConfig,  # `resolve_config` sets its open numbers by the views
         *,
         seed: Sequence[int],
         formation: Formation | None = None,  # is updated; None: views are compared with plain renders

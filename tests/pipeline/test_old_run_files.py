@@ -24,6 +24,7 @@ OTHER_DEFAULTS = [
     "rivr.targets=auto",
     "g0.formation.pose=off",
     "g0.background=[0.0, 0.0, 0.0]",
+    "g0.coarse_share=0.25",
 ]
 """Settings that the recipe had then and has no longer. A run keeps those of its file."""
 

@@ -11,8 +11,16 @@ from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.stages import installed
 from cleargs.scene.config import G0Config
-from cleargs.splat.budget import START_SHARE, gaussians_by_step, planned_start, resolve_config, training_cost
+from cleargs.splat.budget import (
+    START_SHARE,
+    gaussians_by_step,
+    planned_start,
+    resolve_config,
+    resolved,
+    training_cost,
+)
 from cleargs.splat.config import Quality, TrainConfig, budget_from_pixels, steps_from_frames
+from cleargs.splat.schedule import Schedule
 from cleargs.splat.trainer import Trainer
 from cleargs.stages.config import DistilConfig
 
@@ -41,6 +49,26 @@ def test_given_steps_and_budget_are_kept() -> None:
     given = resolve_config(G0Config(steps=7, budget=9, quality="high"), seen)
     assert (given.length, given.budget) == (7, 9)
     assert DistilConfig().applied_to(G0Config(), 3).length * 16 == steps_from_frames(3)
+
+
+def test_a_draft_of_large_images_is_longer_on_reduced_ones() -> None:
+    large, small = 640 * 480, 320 * 180
+    draft = TrainConfig(quality="draft")
+    assert [resolved(draft, 9, 9 * pixels).coarse_share for pixels in (large, small)] == [0.5, 0.25]
+    assert resolved(TrainConfig(), 9, 9 * large).coarse_share == 0.25
+    assert resolved(TrainConfig(quality="draft", coarse_share=0.0), 9, 9 * large).coarse_share == 0.0
+    schedule = Schedule(resolved(draft, 9, 9 * large))
+    assert [schedule.image_factor(step) for step in (0, 399, 400, 799)] == [0.5, 0.5, 1.0, 1.0]
+    costs = [
+        training_cost(config, 9, large / 1e6, 20_000) for config in (draft, longer_on_whole_images(draft))
+    ]
+    assert costs[0].seconds < costs[1].seconds and costs[0].gaussians == costs[1].gaussians
+    with pytest.raises(ValueError, match="not set yet"):
+        assert TrainConfig(steps=9).coarse_steps
+
+
+def longer_on_whole_images(config: TrainConfig) -> TrainConfig:
+    return config.model_copy(update={"coarse_share": 0.25})
 
 
 def test_trainer_resolves_open_settings() -> None:
