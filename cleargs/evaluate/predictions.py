@@ -52,8 +52,8 @@ Predict = Callable[[ReferenceView, ImageU8, MaskBool | None], Prediction]
 def exposure_of(folder: Path) -> float:
     """Return the median exposure time, s, that a training found with measured motions; 0 if it is unknown.
 
-    As in the training, fewer than `MIN_EXPOSED_FRAMES` frames do not show it: one frame of 52 sharp ones that
-    got a blur by chance would blur all renders.
+    Fewer than `MIN_EXPOSED_FRAMES` frames do not show it: one frame of 52 sharp ones that got a blur by
+    chance would blur all renders. Unlike the training, short blurs count, too.
     """
     rows = SceneFolder(folder).formation_rows().values()
     times = [row["exposure_s"] for row in rows if row.get("exposure_s")]

@@ -37,7 +37,7 @@ def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: 
     """Estimate the wall seconds of each step on two idle cores, [length].
 
     Later steps take longer, as the number of Gaussians grows from ``start``. ``megapixels`` are per frame.
-    No number that `resolve_config` sets may be unset in ``config``.
+    ``config`` is one of `resolve_config`.
     """
     step = config.first + np.arange(config.length)
     reduced = np.where(step < config.coarse_steps, config.coarse_factor**2, 1.0)
