@@ -191,7 +191,9 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         known=lambda job: file_of(job, context.cache, program),
     )
     scene = scene.turned_up(frames, reporter)
-    scene, motion = measure_motion(capture, frames, scene, work, reporter)
+    scene, motion = measure_motion(
+        capture, frames, scene, work, reporter, rolling_shutter=config.rolling_shutter
+    )
     registered = {image.name for image in scene.model.images.values()}
     test = held_out(
         config.holdout,

@@ -118,7 +118,7 @@ def variant_config(
     """Return the configuration of a variant.
 
     A variant with its own recipe still uses the ingest settings of ``recipe``, so that all variants see the
-    same images at the same poses.
+    same images. Only a variant that does not model a rolling shutter has cameras without one.
 
     Args:
         dag: The stages.

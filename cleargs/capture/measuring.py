@@ -81,8 +81,8 @@ class CameraMotion:
             row["readout_kept_out_px"] = [round(found.still_px, 4), round(found.rolled_px, 4)]
         return row
 
-    def report(self, reporter: Reporter) -> None:
-        """Say which readout times were found."""
+    def report(self, reporter: Reporter, *, searched: bool) -> None:
+        """Say which readout times were found, or that none was, if they were searched for."""
         if not self.motions:
             return
         factor, unit = (1000.0, "ms") if self.clocked else (1.0, "frames")
@@ -93,15 +93,22 @@ class CameraMotion:
                 f"{'column' if found.columns else 'row'} to the last; points that the fit did not use are "
                 f"off by {found.rolled_px:.2f} px, not {found.still_px:.2f}"
             )
-        if not self.readouts:
+        if searched and not self.readouts:
             reporter.info("no rolling shutter found")
 
 
 def measure_motion(
-    capture: Capture, frames: Sequence[WorkFrame], scene: Reconstruction, work: Path, reporter: Reporter
+    capture: Capture,
+    frames: Sequence[WorkFrame],
+    scene: Reconstruction,
+    work: Path,
+    reporter: Reporter,
+    *,
+    rolling_shutter: bool,
 ) -> tuple[Reconstruction, CameraMotion]:
     """Measure the motion of the frames with a pose, and the readout time of each lens.
 
+    Without ``rolling_shutter`` no readout time is searched for.
     Poses and cameras are adjusted to the readout times that are found, unless they are those of the input.
     The tracks of a killed run in the folder ``work`` are used again.
     """
@@ -116,7 +123,13 @@ def measure_motion(
         return scene, none
     write_model(folder / "start", model, np.zeros((len(model.xyz), 3), np.uint8))
     given = scene.outcome.method == "given"
-    job = MotionJob(folder=folder, model=folder / "start", given=given, lenses=dict(none.lens_of))
+    job = MotionJob(
+        folder=folder,
+        model=folder / "start",
+        given=given,
+        rolling_shutter=rolling_shutter,
+        lenses=dict(none.lens_of),
+    )
     write_json(folder / "job.json", job.model_dump(mode="json"))
     run_child("cleargs.capture.motion_worker", folder / "job.json", folder / "motion.log", reporter)
     motions = _read_motions(folder / MOTIONS)
@@ -132,7 +145,7 @@ def measure_motion(
         scene, factor = scene.with_model(read_model(folder / ADJUSTED))
         motions = {image: in_other_units(motion, factor) for image, motion in motions.items()}
     motion = replace(none, motions=motions, readouts=readouts)
-    motion.report(reporter)
+    motion.report(reporter, searched=rolling_shutter)
     return scene, motion
 
 

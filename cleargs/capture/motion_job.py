@@ -23,6 +23,8 @@ class MotionJob(FrozenModel):
     model: Path
     given: bool
     """True if the poses and cameras are those of the input. They stay."""
+    rolling_shutter: bool
+    """False if no readout time is searched for."""
     lenses: dict[str, int]
     """Working image -> number of its lens: a camera of the model, in one video or folder."""
 

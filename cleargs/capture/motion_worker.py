@@ -52,7 +52,7 @@ def main() -> int:
     job = MotionJob.model_validate(read_json(Path(sys.argv[1])))
     report(phase="measuring the camera's motion", total=None)
     capture = _Capture(job)
-    readouts = capture.readouts()
+    readouts = capture.readouts() if job.rolling_shutter else []
     if readouts:
         capture.roll(readouts, poses=not job.given)
         write_model(job.folder / ADJUSTED, *capture.model())

@@ -111,7 +111,7 @@ def test_page_shows_every_variant_at_every_pose(out: Path) -> None:
 
 def test_variants_share_equal_stages(out: Path) -> None:
     stored = {stage: list((out / ".store" / stage).iterdir()) for stage in ("ingest", "rva", "g0")}
-    assert len(stored["ingest"]) == 1
+    assert len(stored["ingest"]) == 2  # with and without a search for a rolling shutter
     assert len(stored["rva"]) == 3  # all views, binary weights, graded weights
     assert len(stored["g0"]) == 4  # `full` has fewer G0 steps than `rva`
     cells = json.loads((out / "comparison.json").read_text())["cells"]

@@ -26,7 +26,14 @@ def test_settings_of_every_variant_are_valid(variant: Variant) -> None:
 
 def test_every_variant_has_the_same_images() -> None:
     found = [variant_config(installed(), v, "default", ("ingest.max_size=320",), 0) for v in VARIANTS]
-    assert all(config.sections["ingest"] == found[0].sections["ingest"] for config in found)
+    images = [config.sections["ingest"].model_copy(update={"rolling_shutter": True}) for config in found]
+    assert all(settings == images[0] for settings in images)
+
+
+def test_cameras_have_a_readout_only_where_the_training_renders_it() -> None:
+    for variant in VARIANTS:
+        sections = variant_config(installed(), variant, "default", (), 0).sections
+        assert sections["ingest"].rolling_shutter == sections["g0"].formation.enabled, variant.name
 
 
 @pytest.mark.parametrize("recipe", ["default", "smoke", "paper"])

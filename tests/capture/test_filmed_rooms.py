@@ -21,8 +21,8 @@ def filmed(folder: Path, protocol: str) -> Path:
     return room
 
 
-def ingested(room: Path, run: Path, *, threads: int = 2) -> dict[str, Any]:
-    arguments = ["--max-frames", "16", "--until", "ingest", "--no-report", "--threads", str(threads)]
+def ingested(room: Path, run: Path, *more: str, threads: int = 2) -> dict[str, Any]:
+    arguments = ["--max-frames", "16", "--until", "ingest", "--no-report", "--threads", str(threads), *more]
     assert invoke(["run", str(room / "capture.mp4"), "-o", str(run), *arguments], installed()) == 0
     return dict(read_manifest(run / "ingest").summary)
 
@@ -43,6 +43,9 @@ def test_a_rolling_shutter_and_the_motion_of_a_room_are_measured(tmp_path: Path)
     assert json.dumps(other, sort_keys=True) == json.dumps(summary, sort_keys=True)
     files = [read_manifest(tmp_path / run / "ingest").files for run in ("run", "again")]
     assert files[0] == files[1]
+    still = ingested(room, tmp_path / "still", "--set", "ingest.rolling_shutter=false")
+    assert still["readout_ms"] is None and still["motion"] == summary["motion"]
+    assert still["registered"] == summary["registered"]
 
 
 @pytest.mark.slow
