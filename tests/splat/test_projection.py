@@ -172,3 +172,15 @@ def test_scaled_camera_sees_the_same():
     gaussians = make_gaussians(camera, 20, size_px=8.0)
     fine = render(gaussians, camera.scaled(2.0)).image.reshape(24, 2, 32, 2, 3).mean(dim=(1, 3))
     assert (fine - render(gaussians, camera).image).abs().mean() < 0.01
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_a_splat_does_not_depend_on_its_neighbours(antialias):
+    camera = make_camera(150, 100)
+    gaussians = make_gaussians(camera, 1500, size_px=4.0, aspect=5.0)
+    order = torch.from_numpy(np.random.default_rng(3).permutation(1500))
+    splats, tiles, radii = project(gaussians, camera, antialias)
+    for chosen in (order, order[:700], order[:3]):
+        others = project(gaussians.select(chosen), camera, antialias)
+        for one, other in zip((splats, tiles, radii), others, strict=True):
+            assert np.array_equal(one[chosen], other)

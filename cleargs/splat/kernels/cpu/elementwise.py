@@ -129,7 +129,12 @@ def add_noise(
                 continue
             a, b = normal_pair(key, np.uint64(2 * g))
             c, _ = normal_pair(key, np.uint64(2 * g + 1))
-            w, x, y, z, _ = unit_quaternion(rotations[g])
+            w, x, y, z, _ = unit_quaternion(
+                np.float64(rotations[g, 0]),
+                np.float64(rotations[g, 1]),
+                np.float64(rotations[g, 2]),
+                np.float64(rotations[g, 3]),
+            )
             sx = math.exp(np.float64(log_scales[g, 0]))
             sy = math.exp(np.float64(log_scales[g, 1]))
             sz = math.exp(np.float64(log_scales[g, 2]))

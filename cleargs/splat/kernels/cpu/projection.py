@@ -16,6 +16,9 @@ No step loses digits to cancellation. The determinant of the thinnest needle can
 The derivative has no large terms of opposite sign: k is at the minimum, so dk drops out. Geometry is computed
 in float64, colours in float32.
 
+Geometry is arithmetic over rows of `LANES` Gaussians, without branches, so LLVM makes vector code of it. A
+first loop finds the Gaussians that can touch the image; only these are read and projected.
+
 Anti-aliasing (Mip-Splatting, Yu et al. 2024, eq. 9 with gsplat's constant) multiplies the opacity by
 rho = sqrt(det(U Uᵀ) / det Σ), where det(U Uᵀ) = |w x u1|².
 """
@@ -31,9 +34,11 @@ from numba import prange
 from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.binning import count_tiles
-from cleargs.splat.kernels.cpu.harmonics import sh_basis
+from cleargs.splat.kernels.cpu.harmonics import FUNCTIONS, sh_basis
 from cleargs.splat.kernels.cpu.jit import inlined, kernel
-from cleargs.types import AnyArray, ArrayF32
+from cleargs.splat.kernels.cpu.lane_math import LANES, exp, log2
+from cleargs.splat.kernels.cpu.simd import prefetch, prefetch_to_write
+from cleargs.types import AnyArray, ArrayF32, ArrayF64
 
 DILATION = constants.DILATION
 NEAR = constants.NEAR
@@ -45,8 +50,16 @@ TWO_LN2 = 2.0 * math.log(2.0)
 WIDEST = -TWO_LN2 * LOG2_ALPHA_CUT * 1.01
 """Square of the distance, in standard deviations, at which an opaque splat ends, and a margin."""
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-BLOCK = 128
+BLOCK = 1024
 """Gaussians per work item; fixed, so that nothing depends on the number of threads."""
+
+POSE_ROWS = 12
+"""Rows of the scratch memory that hold the pose of each lane."""
+_X, _Y, _Z, _LARGEST, _SEEN = range(POSE_ROWS, POSE_ROWS + 5)
+_ROTATION, _LOG_SCALES, _LOGIT = 17, 21, 24
+_SPLAT = 25  # columns of a splat without its colour, then what makes it valid
+_REACH = _SPLAT + layout.SPLAT_COLUMNS
+_ROWS = _REACH + 1
 
 ZERO = np.float32(0)
 
@@ -86,13 +99,27 @@ class ProjectionView(NamedTuple):
 
 
 @inlined
-def own_view(g: int, view: ProjectionView, poses: AnyArray) -> ProjectionView:
-    """Return the view of Gaussian ``g``: by its row of ``poses`` [N, 12], or of [0, 12] the view itself."""
-    if len(poses) == 0:
-        return view
-    p = poses[g]
+def set_poses(view: ProjectionView, rows: ArrayF64) -> None:
+    """Write the pose of ``view`` for all lanes into the first `POSE_ROWS` of ``rows``."""
+    for row in range(POSE_ROWS):
+        for lane in range(LANES):
+            rows[row, lane] = view[row]
+
+
+@inlined
+def read_poses(poses: AnyArray, g: int, lane: int, rows: ArrayF64) -> None:
+    """Write the pose of Gaussian ``g`` for a lane; nothing if ``poses`` is [0, 12]."""
+    if len(poses) > 0:
+        for row in range(POSE_ROWS):
+            rows[row, lane] = poses[g, row]
+
+
+@inlined
+def lane_view(view: ProjectionView, rows: ArrayF64, lane: int) -> ProjectionView:
+    """Return the view of a lane: ``view`` with the pose in ``rows``."""
     return ProjectionView(
-        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11],
+        rows[0, lane], rows[1, lane], rows[2, lane], rows[3, lane], rows[4, lane], rows[5, lane],
+        rows[6, lane], rows[7, lane], rows[8, lane], rows[9, lane], rows[10, lane], rows[11, lane],
         view.centre_x, view.centre_y, view.centre_z, view.fx, view.fy, view.cx, view.cy,
         view.left, view.right, view.top, view.bottom,
     )  # fmt: skip
@@ -128,9 +155,8 @@ def is_finite(x: Any) -> bool:
 
 
 @inlined
-def camera_position(mean: AnyArray, view: ProjectionView) -> Vector:
-    """Return the Gaussian's centre in camera coordinates."""
-    x, y, z = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+def camera_position(x: float, y: float, z: float, view: ProjectionView) -> Vector:
+    """Return a point of the world, float64, in camera coordinates."""
     return (
         view.w00 * x + view.w01 * y + view.w02 * z + view.tx,
         view.w10 * x + view.w11 * y + view.w12 * z + view.ty,
@@ -139,20 +165,18 @@ def camera_position(mean: AnyArray, view: ProjectionView) -> Vector:
 
 
 @inlined
-def direction_to(mean: AnyArray, view: ProjectionView) -> tuple[Vector, float]:
-    """Return the unit vector in the world from the camera to the Gaussian's centre, and their distance."""
-    x, y = np.float64(mean[0]) - view.centre_x, np.float64(mean[1]) - view.centre_y
-    z = np.float64(mean[2]) - view.centre_z
+def direction_to(x: float, y: float, z: float, view: ProjectionView) -> tuple[Vector, float]:
+    """Return the unit vector in the world from the camera to a point, and their distance."""
+    x, y, z = x - view.centre_x, y - view.centre_y, z - view.centre_z
     distance = math.sqrt(x * x + y * y + z * z)
     return (x / distance, y / distance, z / distance), distance
 
 
 @inlined
-def unit_quaternion(rotation: AnyArray) -> tuple[float, float, float, float, float]:
+def unit_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
     """Return the normalised quaternion w x y z and the norm that it was divided by."""
-    w, x = np.float64(rotation[0]), np.float64(rotation[1])
-    y, z = np.float64(rotation[2]), np.float64(rotation[3])
-    norm = max(math.sqrt(w * w + x * x + y * y + z * z), QUATERNION_EPSILON)
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    norm = QUATERNION_EPSILON if norm < QUATERNION_EPSILON else norm
     return w / norm, x / norm, y / norm, z / norm, norm
 
 
@@ -169,11 +193,17 @@ def scaled_axes(
 
 
 @inlined
+def bounded(value: float, low: float, high: float) -> float:
+    value = low if value < low else value
+    return high if value > high else value
+
+
+@inlined
 def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple[Vector, Vector]:
     """Return the rows of J W. The clamps of x/z and y/z keep the linearisation near the image."""
     jx, jy = view.fx / z, view.fy / z
-    jxz = -jx * min(max(x / z, view.left), view.right)
-    jyz = -jy * min(max(y / z, view.top), view.bottom)
+    jxz = -jx * bounded(x / z, view.left, view.right)
+    jyz = -jy * bounded(y / z, view.top, view.bottom)
     return (
         (jx * view.w00 + jxz * view.w20, jx * view.w01 + jxz * view.w21, jx * view.w02 + jxz * view.w22),
         (jy * view.w10 + jyz * view.w20, jy * view.w11 + jyz * view.w21, jy * view.w12 + jyz * view.w22),
@@ -188,76 +218,137 @@ def outside(mean: float, size: int, row: Vector, largest: float) -> bool:
     the image.
     """
     extent = math.sqrt(WIDEST * (dot(row, row) * largest * largest + DILATION)) + 1.0
-    return mean + extent < 0.0 or mean - extent > size + layout.TILE  # tiles may end beyond the image
+    # Tiles may end beyond the image.
+    return (mean + extent < 0.0) | (mean - extent > size + layout.TILE)
 
 
 @inlined
-def project_one(
-    g: int,
+def list_candidates(
+    first: int,
+    last: int,
     parameters: Parameters,
-    sh_count: int,
     view: ProjectionView,
-    antialias: bool,
-    size: tuple[int, int],  # width and height, px
-    splats: ArrayF32,
-    basis: ArrayF32,
-) -> bool:
-    """Write the packed splat of Gaussian ``g``.
+    poses: AnyArray,
+    size: tuple[int, int],
+    rows: ArrayF64,
+    found: AnyArray,
+    count: int,
+) -> int:
+    """Append to ``found`` the Gaussians from ``first`` on that may touch the image; return the new ``count``.
 
-    Return False if it is behind, outside the image, too faint or not finite.
+    The others are behind the camera or outside the image.
+    """
+    means, log_scales = parameters[0], parameters[1]
+    for lane in range(LANES):
+        g = min(first + lane, last)
+        rows[_X, lane], rows[_Y, lane], rows[_Z, lane] = means[g, 0], means[g, 1], means[g, 2]
+        rows[_LARGEST, lane] = max(log_scales[g, 0], log_scales[g, 1], log_scales[g, 2])
+        read_poses(poses, g, lane, rows)
+    for lane in range(LANES):
+        own = lane_view(view, rows, lane)
+        x, y, z = camera_position(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], own)
+        row0, row1 = projection_rows(x, y, z, own)
+        largest = exp(rows[_LARGEST, lane])
+        seen = (z >= NEAR) & (z <= FLOAT32_MAX)  # not if z is NaN
+        seen &= not outside(view.fx * x / z + view.cx, size[0], row0, largest)
+        seen &= not outside(view.fy * y / z + view.cy, size[1], row1, largest)
+        rows[_SEEN, lane] = 1.0 if seen else 0.0
+    for lane in range(min(LANES, last + 1 - first)):
+        found[count] = first + lane
+        count += rows[_SEEN, lane] > 0.0
+    return count
+
+
+@inlined
+def project_lanes(
+    found: AnyArray,
+    first: int,
+    last: int,
+    parameters: Parameters,
+    view: ProjectionView,
+    poses: AnyArray,
+    antialias: bool,
+    rows: ArrayF64,
+    basis: ArrayF32,
+    sh_count: int,
+    splats: ArrayF32,
+) -> None:
+    """Write splats without colour, their SH basis and reach, of the Gaussians from ``found[first]`` on.
+
+    The reach is negative, or NaN, for a splat that is too faint or not finite.
     """
     means, log_scales, rotations, logits, sh = parameters
-    x, y, z = camera_position(means[g], view)
-    if not NEAR <= z <= FLOAT32_MAX:  # also if z is NaN
-        return False
-    row0, row1 = projection_rows(x, y, z, view)
-    mean_x, mean_y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-    largest = math.exp(max(log_scales[g, 0], log_scales[g, 1], log_scales[g, 2]))
-    if outside(mean_x, size[0], row0, largest) or outside(mean_y, size[1], row1, largest):
-        return False
-    qw, qx, qy, qz, _ = unit_quaternion(rotations[g])
-    sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])
-    axis0, axis1, axis2 = scaled_axes(qw, qx, qy, qz, sx, sy, sz)
-    u0 = (dot(row0, axis0), dot(row0, axis1), dot(row0, axis2))
-    u1 = (dot(row1, axis0), dot(row1, axis1), dot(row1, axis2))
-    xx, xy, yy = dot(u0, u0) + DILATION, dot(u0, u1), dot(u1, u1) + DILATION
-    skew = xy / yy
-    w = residual(u0, u1, skew)
-    variance = dot(w, w) + DILATION * (1.0 + skew * skew)
-    log2_opacity = -math.log1p(math.exp(-np.float64(logits[g]))) / math.log(2.0)
-    if antialias:
-        normal = cross(w, u1)
-        log2_opacity += 0.5 * math.log2(dot(normal, normal) / (variance * yy))
-    reach = TWO_LN2 * (log2_opacity - LOG2_ALPHA_CUT)
-    if not (reach >= 0.0 and is_finite(variance) and is_finite(xx) and is_finite(yy)):
-        return False
-    if not (is_finite(mean_x) and is_finite(mean_y)):
-        return False
+    for lane in range(LANES):
+        g = found[min(first + lane, last)]
+        for axis in range(3):
+            rows[_X + axis, lane] = means[g, axis]
+            rows[_LOG_SCALES + axis, lane] = log_scales[g, axis]
+        for part in range(4):
+            rows[_ROTATION + part, lane] = rotations[g, part]
+        rows[_LOGIT, lane] = logits[g]
+        read_poses(poses, g, lane, rows)
+        for line in range(0, 3 * sh_count, 16):
+            prefetch(sh, g * sh.shape[1] * 3 + line)
+        prefetch_to_write(splats, g * layout.SPLAT_COLUMNS)
+    for lane in range(LANES):
+        own = lane_view(view, rows, lane)
+        x, y, z = camera_position(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], own)
+        row0, row1 = projection_rows(x, y, z, own)
+        mean_x, mean_y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+        qw, qx, qy, qz, _ = unit_quaternion(
+            rows[_ROTATION, lane],
+            rows[_ROTATION + 1, lane],
+            rows[_ROTATION + 2, lane],
+            rows[_ROTATION + 3, lane],
+        )
+        sx, sy = exp(rows[_LOG_SCALES, lane]), exp(rows[_LOG_SCALES + 1, lane])
+        axis0, axis1, axis2 = scaled_axes(qw, qx, qy, qz, sx, sy, exp(rows[_LOG_SCALES + 2, lane]))
+        u0 = (dot(row0, axis0), dot(row0, axis1), dot(row0, axis2))
+        u1 = (dot(row1, axis0), dot(row1, axis1), dot(row1, axis2))
+        xx, xy, yy = dot(u0, u0) + DILATION, dot(u0, u1), dot(u1, u1) + DILATION
+        skew = xy / yy
+        w = residual(u0, u1, skew)
+        variance = dot(w, w) + DILATION * (1.0 + skew * skew)
+        log2_opacity = -log2(1.0 + exp(-rows[_LOGIT, lane]))
+        if antialias:
+            normal = cross(w, u1)
+            log2_opacity += 0.5 * log2(dot(normal, normal) / (variance * yy))
+        reach = TWO_LN2 * (log2_opacity - LOG2_ALPHA_CUT)
+        finite = is_finite(variance) & is_finite(xx) & is_finite(yy) & is_finite(mean_x) & is_finite(mean_y)
+        rows[_REACH, lane] = reach if finite else -1.0
+        rows[_SPLAT + layout.MEAN_X, lane] = mean_x
+        rows[_SPLAT + layout.MEAN_Y, lane] = mean_y
+        rows[_SPLAT + layout.BEND_X, lane] = HALF_LOG2E / variance
+        rows[_SPLAT + layout.SKEW, lane] = skew
+        rows[_SPLAT + layout.BEND_Y, lane] = HALF_LOG2E / yy
+        rows[_SPLAT + layout.LOG2_OPACITY, lane] = log2_opacity
+        rows[_SPLAT + layout.DEPTH, lane] = z
+        rows[_SPLAT + layout.EXTENT_X, lane] = math.sqrt(reach * xx)
+        rows[_SPLAT + layout.EXTENT_Y, lane] = math.sqrt(reach * yy)
+        rows[_SPLAT + layout.EXTENT_X_AT, lane] = xy * math.sqrt(reach / xx)
+        direction, _ = direction_to(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], view)
+        sh_basis(np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2]), basis, lane)
 
-    direction, _ = direction_to(means[g], view)
-    sh_basis(sh_count, np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2]), basis)
+
+@inlined
+def write_splat(
+    g: int, lane: int, sh: ArrayF32, sh_count: int, rows: ArrayF64, basis: ArrayF32, splat: ArrayF32
+) -> bool:
+    """Write the splat of a lane with its colour; return False if it is too faint or not finite."""
+    if not rows[_REACH, lane] >= 0.0:  # also if it is NaN
+        return False
     red = green = blue = ZERO
     for k in range(sh_count):
-        red += basis[k] * sh[g, k, 0]
-        green += basis[k] * sh[g, k, 1]
-        blue += basis[k] * sh[g, k, 2]
+        red += basis[k, lane] * sh[g, k, 0]
+        green += basis[k, lane] * sh[g, k, 1]
+        blue += basis[k, lane] * sh[g, k, 2]
     if not (is_finite(red) and is_finite(green) and is_finite(blue)):
         return False
-
-    splat = splats[g]
-    splat[layout.MEAN_X] = mean_x
-    splat[layout.MEAN_Y] = mean_y
-    splat[layout.BEND_X] = HALF_LOG2E / variance
-    splat[layout.SKEW] = skew
-    splat[layout.BEND_Y] = HALF_LOG2E / yy
-    splat[layout.LOG2_OPACITY] = log2_opacity
+    for column in range(layout.EXTENT_X_AT + 1):
+        splat[column] = rows[_SPLAT + column, lane]
     splat[layout.RED] = max(red + SH_OFFSET, ZERO)
     splat[layout.GREEN] = max(green + SH_OFFSET, ZERO)
     splat[layout.BLUE] = max(blue + SH_OFFSET, ZERO)
-    splat[layout.DEPTH] = z
-    splat[layout.EXTENT_X] = math.sqrt(reach * xx)
-    splat[layout.EXTENT_Y] = math.sqrt(reach * yy)
-    splat[layout.EXTENT_X_AT] = xy * math.sqrt(reach / xx)
     return True
 
 
@@ -266,7 +357,7 @@ def project(
     parameters: Parameters,
     sh_count: int,
     view: ProjectionView,
-    poses: AnyArray,  # [N, 12] or [0, 12], see `own_view`
+    poses: AnyArray,  # [N, 12] float64, the pose of each Gaussian's row; [0, 12]: that of the view
     antialias: bool,
     width: int,
     height: int,
@@ -276,17 +367,35 @@ def project(
 ) -> None:
     """Write the packed splats, the number of tiles that each touches, and their radii.
 
-    Culled Gaussians get no tile and radius 0; their rows of ``splats`` are not written.
+    Culled Gaussians get no tile and radius 0; their rows of ``splats`` are not written. They are behind the
+    camera, outside the image, too faint or not finite.
     """
     n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
-        basis = np.empty(16, np.float32)
-        for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
-            tiles = 0
-            own = own_view(g, view, poses)
-            if project_one(g, parameters, sh_count, own, antialias, (width, height), splats, basis):
-                tiles = count_tiles(splats[g], width, height)
-                if len(poses) > 0:  # different poses would mix the order of Gaussians on one surface
-                    splats[g, layout.DEPTH] = max(camera_position(parameters[0][g], view)[2], NEAR)
-            tile_counts[g] = tiles
-            radii[g] = max(splats[g, layout.EXTENT_X], splats[g, layout.EXTENT_Y]) if tiles > 0 else ZERO
+        begin, end = block * BLOCK, min(n, (block + 1) * BLOCK)
+        rows, found = np.empty((_ROWS, LANES)), np.empty(BLOCK, np.int64)
+        basis = np.empty((FUNCTIONS, LANES), np.float32)
+        set_poses(view, rows)
+        count = 0
+        for first in range(begin, end, LANES):
+            count = list_candidates(
+                first, end - 1, parameters, view, poses, (width, height), rows, found, count
+            )
+        for g in range(begin, end):
+            tile_counts[g] = 0
+            radii[g] = ZERO
+        for first in range(0, count, LANES):
+            project_lanes(
+                found, first, count - 1, parameters, view, poses, antialias, rows, basis, sh_count, splats
+            )
+            for lane in range(min(LANES, count - first)):
+                g = found[first + lane]
+                if write_splat(g, lane, parameters[4], sh_count, rows, basis, splats[g]):
+                    tiles = count_tiles(splats[g], width, height)
+                    tile_counts[g] = tiles
+                    if tiles > 0:
+                        radii[g] = max(splats[g, layout.EXTENT_X], splats[g, layout.EXTENT_Y])
+                    if len(poses) > 0:  # different poses would mix the order of Gaussians on one surface
+                        mean = parameters[0][g]
+                        x, y, z = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+                        splats[g, layout.DEPTH] = max(camera_position(x, y, z, view)[2], NEAR)

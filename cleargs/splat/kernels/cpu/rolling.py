@@ -9,10 +9,11 @@ from numba import prange
 
 from cleargs.splat.constants import NEAR
 from cleargs.splat.kernels.cpu.jit import inlined, kernel
-from cleargs.splat.kernels.cpu.projection import BLOCK
 from cleargs.splat.rolling import BEYOND, STEEPEST, STEPS, seen_at
 from cleargs.types import AnyArray, ArrayF32, ArrayF64
 
+BLOCK = 128
+"""Gaussians per work item; fixed, so that nothing depends on the number of threads."""
 _seen_at = inlined(seen_at)
 
 
