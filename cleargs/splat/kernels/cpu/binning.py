@@ -18,7 +18,8 @@ from numba import prange
 
 from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
-from cleargs.splat.kernels.cpu.jit import exact, kernel, serial_kernel
+from cleargs.splat.kernels.cpu.jit import exact, inlined, kernel, serial_kernel
+from cleargs.splat.kernels.cpu.simd import prefetch
 from cleargs.types import AnyArray, ArrayF32
 
 REACH_MARGIN = 2e-3
@@ -28,6 +29,8 @@ LOG2_ALPHA_CUT = constants.LOG2_ALPHA_CUT - REACH_MARGIN
 PIXEL_CENTRE = constants.PIXEL_CENTRE
 BLOCK = 256
 """Gaussians per work item."""
+AHEAD = 12
+"""Gaussians whose pairs are prefetched."""
 RADIX_BITS = 11
 RADIX = 1 << RADIX_BITS
 RADIX_PASSES = 3
@@ -168,6 +171,13 @@ def list_pairs(
                     pair += 1
 
 
+@inlined
+def prefetch_pairs(i: int, end: int, order: AnyArray, pair_offsets: AnyArray, pair_tiles: AnyArray) -> None:
+    """Prefetch what the loop over ``order`` reads next: in depth order, it is at random places in memory."""
+    prefetch(pair_offsets, np.int64(order[min(i + 2 * AHEAD, end - 1)]))
+    prefetch(pair_tiles, pair_offsets[order[min(i + AHEAD, end - 1)]])
+
+
 @kernel
 def sort_pairs_by_tile(
     order: AnyArray,  # [visible] Gaussians by depth
@@ -187,7 +197,9 @@ def sort_pairs_by_tile(
     n = order.shape[0]
     for chunk in prange(chunks):
         counts[chunk, :] = 0
-        for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+        end = n * (chunk + 1) // chunks
+        for i in range(n * chunk // chunks, end):
+            prefetch_pairs(i, end, order, pair_offsets, pair_tiles)
             g = order[i]
             for pair in range(pair_offsets[g], pair_offsets[g + np.uint32(1)]):
                 counts[chunk, pair_tiles[pair]] += 1
@@ -200,7 +212,9 @@ def sort_pairs_by_tile(
             start += count
     tile_offsets[tiles] = start
     for chunk in prange(chunks):
-        for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+        end = n * (chunk + 1) // chunks
+        for i in range(n * chunk // chunks, end):
+            prefetch_pairs(i, end, order, pair_offsets, pair_tiles)
             g = order[i]
             for pair in range(pair_offsets[g], pair_offsets[g + np.uint32(1)]):
                 tile = pair_tiles[pair]
