@@ -20,7 +20,7 @@ from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.formation import clip_to_saturation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import blur_sums as blur_kernels
-from cleargs.splat.kernels.cpu import elementwise, frame_search, frame_warp, loss
+from cleargs.splat.kernels.cpu import elementwise, frame_search, frame_warp, loss, noise
 from cleargs.splat.kernels.cpu.jit import LAUNCHING
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import (
@@ -177,7 +177,7 @@ def add_position_noise(
     key = np.random.SeedSequence([*seed]).generate_state(1, np.uint64)[0]
     means, log_scales, rotations = gaussians.means, gaussians.log_scales, gaussians.rotations
     with LAUNCHING:
-        elementwise.add_noise(
+        noise.add_noise(
             *(means.numpy(), log_scales.numpy(), rotations.numpy(), gaussians.logit_opacities.numpy()),
             *(amount, min_opacity, densification.NOISE_CUT, key),
         )
