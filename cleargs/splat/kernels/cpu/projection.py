@@ -56,8 +56,10 @@ BLOCK = 1024
 POSE_ROWS = 12
 """Rows of the scratch memory that hold the pose of each lane."""
 _X, _Y, _Z, _LARGEST, _SEEN = range(POSE_ROWS, POSE_ROWS + 5)
-_ROTATION, _LOG_SCALES, _LOGIT = 17, 21, 24
-_SPLAT = 25  # columns of a splat without its colour, then what makes it valid
+_ROTATION = _SEEN + 1
+_LOG_SCALES = _ROTATION + 4
+_LOGIT = _LOG_SCALES + 3
+_SPLAT = _LOGIT + 1  # columns of a splat; those of its colour are not used
 _REACH = _SPLAT + layout.SPLAT_COLUMNS
 _ROWS = _REACH + 1
 
