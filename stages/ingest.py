@@ -30,6 +30,11 @@ class IngestConfig(SfmConfig, CaptureConfig):
     feature_size: int = Field(
         960, ge=64, description="long side at which features are found, px; never enlarged, at least max_size"
     )
+    rolling_shutter: bool = Field(
+        True,
+        description="look for the readout time of a rolling shutter in a video or numbered images, and fit "
+        "poses and cameras with it; false: all rows of a frame are exposed at once",
+    )
     holdout: str = Field(
         "none",
         description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of every "

@@ -76,7 +76,7 @@ VARIANTS: tuple[Variant, ...] = (
     ),
 )
 """Variants from the simplest to the whole method, then those of the paper's recipe. Stages that have equal
-settings are shared. All variants train and test on the same frames."""
+settings are shared. All variants have the same frames, and the same held-out ones."""
 
 BASELINES = ("all-view", "drop-blurry")
 """Variants that are subtracted from the others in tables of differences."""

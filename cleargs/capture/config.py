@@ -120,11 +120,6 @@ class SfmConfig(FrozenModel):
         angle = math.radians(float(found[1]))
         return 1 / angle if "FISHEYE" in model else 0.5 / math.tan(min(angle, _WIDEST) / 2)
 
-    rolling_shutter: bool = Field(
-        True,
-        description="look for the readout time of a rolling shutter in a video, and fit poses and cameras "
-        "with it; false: all rows of a frame are exposed at once",
-    )
     max_features: int = Field(
         4096, ge=256, le=65536, description="SIFT features per frame, the largest scales first"
     )

@@ -108,9 +108,9 @@ def measure_motion(
 ) -> tuple[Reconstruction, CameraMotion]:
     """Measure the motion of the frames with a pose, and the readout time of each lens.
 
-    Without ``rolling_shutter`` no readout time is searched for.
-    Poses and cameras are adjusted to the readout times that are found, unless they are those of the input.
-    The tracks of a killed run in the folder ``work`` are used again.
+    Without ``rolling_shutter`` no readout time is searched for. Poses and cameras are adjusted to the readout
+    times that are found, unless they are those of the input. The tracks of a killed run in the folder
+    ``work`` are used again.
     """
     model = scene.model
     status = {frame.image: "no neighbours in the input" for frame in frames}

@@ -117,7 +117,7 @@ def test_variants_share_equal_stages(out: Path) -> None:
     cells = json.loads((out / "comparison.json").read_text())["cells"]
     shared = {cell["variant"]: cell["shared_seconds"] for cell in cells}
     assert shared["all-view"] == 0.0
-    assert shared["full"] > shared["rva"] > 0.0
+    assert shared["rva"] > shared["full"] > 0.0  # `full` has its own ingest, and shares the weights only
 
 
 def test_results_contain_roles_and_choices(out: Path) -> None:

@@ -63,13 +63,21 @@ def test_training_is_bitwise_equal_across_threads_and_runs():
     assert len(set(digests)) == 1
 
 
-PROJECTION = """
-import hashlib
-from helpers.splat_scenes import make_camera, make_gaussians
-from test_projection import project
+NEEDLES = """
+import hashlib, torch
+from helpers.splat_scenes import make_camera, make_gaussians, make_needles
+from cleargs.splat.kernels.cpu.backend import rasteriser
 
-camera = make_camera()
-print(hashlib.sha256(project(make_gaussians(camera, 200), camera)[0].tobytes()).hexdigest())
+camera, engine, result = make_camera(), rasteriser(torch.device("cpu")), hashlib.sha256()
+sizes = [(n, 10.0**power) for n in range(60, 70) for power in (4, 6, 8)]
+needles = [make_needles(camera, n, length_px=length, aspect=1e5) for n, length in sizes]
+for gaussians in (make_gaussians(camera, 200), *needles):
+    image = engine.forward(gaussians, camera).image
+    result.update(image.numpy().tobytes())
+    slope = torch.sin(torch.arange(image.numel())).view(image.shape)
+    for gradient in engine.backward(slope).tensors().values():
+        result.update(gradient.numpy().tobytes())
+print(result.hexdigest())
 """
 
 
@@ -80,7 +88,7 @@ def test_compiled_and_cached_kernels_round_alike(tmp_path: Path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": paths}
     compiled, loaded = (
         subprocess.run(
-            [sys.executable, "-c", PROJECTION], env=environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", NEEDLES], env=environment, capture_output=True, text=True, check=True
         ).stdout
         for _ in range(2)
     )

@@ -47,13 +47,13 @@ def test_values_without_a_result():
 
 @pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="x86 instructions")
 def test_geometry_is_vector_code():
-    """Numba's functions were called lane by lane before, which took nearly twice as long."""
+    """Scalar code takes nearly twice as long."""
     view = numba.typeof(projection.ProjectionView(*[1.0] * 23))
     rows = types.float64[:, ::1]
 
     @njit(error_model="numpy", fastmath=set(FAST))
     def lanes(view, antialias):
-        rows = np.empty((gradients.ROWS, lane_math.LANES))
+        rows = np.empty((gradients.ROWS, lane_math.GROUP))
         projection.set_poses(view, rows)
         gradients.backpropagate_lanes(view, antialias, rows)
         return rows
@@ -61,5 +61,4 @@ def test_geometry_is_vector_code():
     lanes.compile((view, types.boolean))
     assert lanes.nopython_signatures[0].return_type == rows
     code = lanes.inspect_asm((view, types.boolean))
-    packed, scalar = code.count("mulpd") + code.count("pd\t"), code.count("mulsd")
-    assert packed > 200 and scalar < packed / 4
+    assert code.count("mulpd") > 100 > 10 * code.count("mulsd")

@@ -30,7 +30,7 @@ PIXEL_CENTRE = constants.PIXEL_CENTRE
 BLOCK = 256
 """Gaussians per work item."""
 AHEAD = 12
-"""Gaussians whose pairs are prefetched."""
+"""Number of Gaussians by which the prefetching of pairs is ahead; that of offsets is twice as far ahead."""
 RADIX_BITS = 11
 RADIX = 1 << RADIX_BITS
 RADIX_PASSES = 3

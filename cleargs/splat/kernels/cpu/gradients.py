@@ -1,7 +1,7 @@
 """Compute the gradients of the raw parameters from the rasteriser's pixel sums.
 
 This is the chain rule of ``projection``, written out with the symbols of its docstring. As there, geometry is
-computed for rows of `LANES` Gaussians in vector code, here those that touch a tile.
+computed for rows of `GROUP` Gaussians in vector code, here those that touch a tile.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from numba import prange
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.harmonics import FUNCTIONS, sh_basis, sh_direction_gradient
 from cleargs.splat.kernels.cpu.jit import inlined, kernel
-from cleargs.splat.kernels.cpu.lane_math import LANES, exp
+from cleargs.splat.kernels.cpu.lane_math import GROUP, exp
 from cleargs.splat.kernels.cpu.projection import (
     BLOCK,
     DILATION,
@@ -80,14 +80,14 @@ def gather(
     pair_sums: ArrayF32,
     rows: ArrayF64,
 ) -> None:
-    """Write parameters and pixel sums of the Gaussians from ``touching[first]`` on into ``rows``.
+    """Write parameters and pixel sums of the next `GROUP` Gaussians of ``touching`` into ``rows``.
 
-    The pair sums are added in order and in float64.
+    They are those from ``first`` to at most ``last``. The pair sums are added in order and in float64.
     """
     means, log_scales, rotations, logits, _ = parameters
     columns = pair_sums.shape[1]
     sums = np.zeros(layout.PAIR_COLUMNS)
-    for lane in range(LANES):
+    for lane in range(GROUP):
         g = touching[min(first + lane, last)]
         for axis in range(3):
             rows[_MEAN + axis, lane] = means[g, axis]
@@ -111,9 +111,10 @@ def gather(
 def backpropagate_lanes(view: ProjectionView, antialias: bool, rows: ArrayF64) -> None:
     """Apply the chain rule of ``project_lanes`` to the pixel sums in ``rows``.
 
-    The gradients of the means lack those by the colours. The directions are for these.
+    `colour_lanes` adds to the gradients of the means what depends on the colour, by the directions that are
+    written here.
     """
-    for lane in range(LANES):
+    for lane in range(GROUP):
         own = lane_view(view, rows, lane)
         x, y, z = camera_position(rows[_MEAN, lane], rows[_MEAN + 1, lane], rows[_MEAN + 2, lane], own)
         qw, qx, qy, qz, norm = unit_quaternion(
@@ -215,16 +216,16 @@ def colour_lanes(
     weights: ArrayF32,  # [16, lanes] scratch
 ) -> None:
     """Write the SH basis of the lanes, and add dL/d(mean) by the colour to ``rows``."""
-    for lane in range(LANES):
+    for lane in range(GROUP):
         g = touching[min(first + lane, last)]
         red, green, blue = rows[_COLOUR, lane], rows[_COLOUR + 1, lane], rows[_COLOUR + 2, lane]
         by_red, by_green, by_blue = np.float32(red), np.float32(green), np.float32(blue)
         for k in range(1, sh_count):
             weights[k, lane] = sh[g, k, 0] * by_red + sh[g, k, 1] * by_green + sh[g, k, 2] * by_blue
     for k in range(sh_count, FUNCTIONS):
-        for lane in range(LANES):
+        for lane in range(GROUP):
             weights[k, lane] = ZERO
-    for lane in range(LANES):
+    for lane in range(GROUP):
         direction = rows[_DIRECTION, lane], rows[_DIRECTION + 1, lane], rows[_DIRECTION + 2, lane]
         x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
         sh_basis(x, y, z, basis, lane)
@@ -293,9 +294,9 @@ def backpropagate(
     """
     n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
-        rows, touching = np.empty((ROWS, LANES)), np.empty(BLOCK, np.int64)
-        basis = np.empty((FUNCTIONS, LANES), np.float32)
-        weights = np.empty((FUNCTIONS, LANES), np.float32)
+        rows, touching = np.empty((ROWS, GROUP)), np.empty(BLOCK, np.int64)
+        basis = np.empty((FUNCTIONS, GROUP), np.float32)
+        weights = np.empty((FUNCTIONS, GROUP), np.float32)
         set_poses(view, rows)
         count = 0
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
@@ -304,10 +305,10 @@ def backpropagate(
             else:
                 touching[count] = g
                 count += 1
-        for first in range(0, count, LANES):
+        for first in range(0, count, GROUP):
             gather(touching, first, count - 1, parameters, poses, splats, pair_offsets, pair_sums, rows)
             backpropagate_lanes(view, antialias, rows)
             colour_lanes(touching, first, count - 1, parameters[4], sh_count, rows, basis, weights)
-            for lane in range(min(LANES, count - first)):
+            for lane in range(min(GROUP, count - first)):
                 g = touching[first + lane]
                 write_gradients(g, lane, sh_count, rows, basis, outputs)

@@ -3,7 +3,8 @@
 The fast-math flags leave out ``nnan`` and ``ninf``, so comparisons with NaN and infinity keep working. They
 also leave out ``reassoc``. Numba compiles the body of a parallel loop twice: alone for the current process,
 and as a part of the kernel for the cache. With ``reassoc`` the two round differently, and a training that
-another process resumes would end with other bits than an uninterrupted one.
+another process resumes would end with other bits than an uninterrupted one. ``contract`` can do the same to a
+sum of two products, since either product may be fused with the sum: see `unfused`.
 
 Every kernel loops over items or blocks of a fixed size, and the arithmetic of an item does not depend on its
 neighbours in the loop. Results are therefore bitwise independent of the number of threads.
@@ -83,6 +84,12 @@ def inlined(function: F) -> F:
     Tuples and SIMD values then stay in registers, and LLVM can vectorise a loop that calls the function.
     """
     return cast(F, njit(fastmath=set(FAST), error_model="numpy", forceinline=True)(function))
+
+
+def unfused(function: F) -> F:
+    """Compile like `inlined`, but with a rounding after each operation, so that all callers round alike."""
+    flags = FAST - {"contract"}
+    return cast(F, njit(fastmath=set(flags), error_model="numpy", forceinline=True)(function))
 
 
 def exact(function: F) -> F:

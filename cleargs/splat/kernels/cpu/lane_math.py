@@ -13,7 +13,7 @@ import numpy as np
 
 from cleargs.splat.kernels.cpu.jit import inlined
 
-LANES = 64
+GROUP = 64
 """Gaussians per loop. A fixed number: a remainder loop could round differently, and the result of a Gaussian
 must not depend on its neighbours."""
 
@@ -49,7 +49,7 @@ def exp(x: Any) -> Any:
 
 @inlined
 def log2(x: Any) -> Any:
-    """Return the logarithm to base 2 of a positive float64; about -1023 for 0, and NaN for infinity."""
+    """Return the logarithm to base 2 of a normal float64 above 0; about -1023 for 0, and NaN for infinity."""
     bits = np.float64(x).view(np.int64)
     mantissa = np.int64((bits & _MANTISSA) | _ONE).view(np.float64)
     exponent = np.int64((bits >> _EXPONENT) | _WHOLE).view(np.float64) - _WHOLE_BIAS

@@ -12,7 +12,7 @@ import numpy as np
 from numba import prange
 
 from cleargs.splat.kernels.cpu.jit import inlined, kernel
-from cleargs.splat.kernels.cpu.lane_math import LANES, exp, log2
+from cleargs.splat.kernels.cpu.lane_math import GROUP, exp, log2
 from cleargs.splat.kernels.cpu.projection import BLOCK, dot, scaled_axes, unit_quaternion
 from cleargs.types import AnyArray, ArrayF32
 
@@ -56,7 +56,7 @@ def normal_pair(key: np.uint64, count: np.uint64) -> tuple[float, float]:
 @inlined
 def move_lanes(rows: AnyArray, ids: AnyArray, amount: float, min_opacity: float, key: np.uint64) -> None:
     """Write the move of the mean of each lane."""
-    for lane in range(LANES):
+    for lane in range(GROUP):
         a, b = normal_pair(key, np.uint64(2) * ids[lane])
         c, _ = normal_pair(key, np.uint64(2) * ids[lane] + np.uint64(1))
         w, x, y, z, _ = unit_quaternion(
@@ -92,7 +92,7 @@ def add_noise(
     n = means.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min(n, (block + 1) * BLOCK)
-        rows, ids = np.empty((_ROWS, LANES)), np.empty(LANES, np.uint64)
+        rows, ids = np.empty((_ROWS, GROUP)), np.empty(GROUP, np.uint64)
         found, opacities = np.empty(BLOCK, np.int64), np.empty(BLOCK)
         for i in range(BLOCK):
             opacities[i] = 1.0 / (1.0 + exp(-np.float64(logits[min(begin + i, end - 1)])))
@@ -100,8 +100,8 @@ def add_noise(
         for g in range(begin, end):
             found[count] = g
             count += opacities[g - begin] < cut
-        for first in range(0, count, LANES):
-            for lane in range(LANES):
+        for first in range(0, count, GROUP):
+            for lane in range(GROUP):
                 g = found[min(first + lane, count - 1)]
                 ids[lane] = g
                 rows[_OPACITY, lane] = opacities[g - begin]
@@ -110,6 +110,6 @@ def add_noise(
                 for axis in range(3):
                     rows[_LOG_SCALES + axis, lane] = log_scales[g, axis]
             move_lanes(rows, ids, amount, min_opacity, key)
-            for lane in range(min(LANES, count - first)):
+            for lane in range(min(GROUP, count - first)):
                 for axis in range(3):
                     means[found[first + lane], axis] += np.float32(rows[_MOVE + axis, lane])

@@ -16,7 +16,7 @@ No step loses digits to cancellation. The determinant of the thinnest needle can
 The derivative has no large terms of opposite sign: k is at the minimum, so dk drops out. Geometry is computed
 in float64, colours in float32.
 
-Geometry is arithmetic over rows of `LANES` Gaussians, without branches, so LLVM makes vector code of it. A
+Geometry is arithmetic over rows of `GROUP` Gaussians, without branches, so LLVM makes vector code of it. A
 first loop finds the Gaussians that can touch the image; only these are read and projected.
 
 Anti-aliasing (Mip-Splatting, Yu et al. 2024, eq. 9 with gsplat's constant) multiplies the opacity by
@@ -35,8 +35,8 @@ from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.binning import count_tiles
 from cleargs.splat.kernels.cpu.harmonics import FUNCTIONS, sh_basis
-from cleargs.splat.kernels.cpu.jit import inlined, kernel
-from cleargs.splat.kernels.cpu.lane_math import LANES, exp, log2
+from cleargs.splat.kernels.cpu.jit import inlined, kernel, unfused
+from cleargs.splat.kernels.cpu.lane_math import GROUP, exp, log2
 from cleargs.splat.kernels.cpu.simd import prefetch, prefetch_to_write
 from cleargs.types import AnyArray, ArrayF32, ArrayF64
 
@@ -104,7 +104,7 @@ class ProjectionView(NamedTuple):
 def set_poses(view: ProjectionView, rows: ArrayF64) -> None:
     """Write the pose of ``view`` for all lanes into the first `POSE_ROWS` of ``rows``."""
     for row in range(POSE_ROWS):
-        for lane in range(LANES):
+        for lane in range(GROUP):
             rows[row, lane] = view[row]
 
 
@@ -137,7 +137,7 @@ def cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@inlined
+@unfused
 def mixed(a: float, u: Vector, b: float, v: Vector) -> Vector:
     """Return a u + b v."""
     return (a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2])
@@ -236,17 +236,18 @@ def list_candidates(
     found: AnyArray,
     count: int,
 ) -> int:
-    """Append to ``found`` the Gaussians from ``first`` on that may touch the image; return the new ``count``.
+    """Append to ``found`` those of the next `GROUP` Gaussians that may touch the image.
 
-    The others are behind the camera or outside the image.
+    The next ones are ``first`` to at most ``last``. Left out is what is behind the camera or outside the
+    image. Returns the new ``count`` of those that were found.
     """
     means, log_scales = parameters[0], parameters[1]
-    for lane in range(LANES):
+    for lane in range(GROUP):
         g = min(first + lane, last)
         rows[_X, lane], rows[_Y, lane], rows[_Z, lane] = means[g, 0], means[g, 1], means[g, 2]
         rows[_LARGEST, lane] = max(log_scales[g, 0], log_scales[g, 1], log_scales[g, 2])
         read_poses(poses, g, lane, rows)
-    for lane in range(LANES):
+    for lane in range(GROUP):
         own = lane_view(view, rows, lane)
         x, y, z = camera_position(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], own)
         row0, row1 = projection_rows(x, y, z, own)
@@ -255,7 +256,7 @@ def list_candidates(
         seen &= not outside(view.fx * x / z + view.cx, size[0], row0, largest)
         seen &= not outside(view.fy * y / z + view.cy, size[1], row1, largest)
         rows[_SEEN, lane] = 1.0 if seen else 0.0
-    for lane in range(min(LANES, last + 1 - first)):
+    for lane in range(min(GROUP, last + 1 - first)):
         found[count] = first + lane
         count += rows[_SEEN, lane] > 0.0
     return count
@@ -275,12 +276,13 @@ def project_lanes(
     sh_count: int,
     splats: ArrayF32,
 ) -> None:
-    """Write splats without colour, their SH basis and reach, of the Gaussians from ``found[first]`` on.
+    """Write splats without colour and their reach into ``rows``, and their SH basis into ``basis``.
 
-    The reach is negative, or NaN, for a splat that is too faint or not finite.
+    They are the next `GROUP` of ``found``, from ``first`` to at most ``last``. The reach is negative, or NaN,
+    for a splat that is too faint or not finite. SH and ``splats`` are only prefetched.
     """
     means, log_scales, rotations, logits, sh = parameters
-    for lane in range(LANES):
+    for lane in range(GROUP):
         g = found[min(first + lane, last)]
         for axis in range(3):
             rows[_X + axis, lane] = means[g, axis]
@@ -292,7 +294,7 @@ def project_lanes(
         for line in range(0, 3 * sh_count, 16):
             prefetch(sh, g * sh.shape[1] * 3 + line)
         prefetch_to_write(splats, g * layout.SPLAT_COLUMNS)
-    for lane in range(LANES):
+    for lane in range(GROUP):
         own = lane_view(view, rows, lane)
         x, y, z = camera_position(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], own)
         row0, row1 = projection_rows(x, y, z, own)
@@ -370,27 +372,27 @@ def project(
     """Write the packed splats, the number of tiles that each touches, and their radii.
 
     Culled Gaussians get no tile and radius 0; their rows of ``splats`` are not written. They are behind the
-    camera, outside the image, too faint or not finite.
+    camera, outside the image or too faint, or their splat is not finite.
     """
     n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min(n, (block + 1) * BLOCK)
-        rows, found = np.empty((_ROWS, LANES)), np.empty(BLOCK, np.int64)
-        basis = np.empty((FUNCTIONS, LANES), np.float32)
+        rows, found = np.empty((_ROWS, GROUP)), np.empty(BLOCK, np.int64)
+        basis = np.empty((FUNCTIONS, GROUP), np.float32)
         set_poses(view, rows)
         count = 0
-        for first in range(begin, end, LANES):
+        for first in range(begin, end, GROUP):
             count = list_candidates(
                 first, end - 1, parameters, view, poses, (width, height), rows, found, count
             )
         for g in range(begin, end):
             tile_counts[g] = 0
             radii[g] = ZERO
-        for first in range(0, count, LANES):
+        for first in range(0, count, GROUP):
             project_lanes(
                 found, first, count - 1, parameters, view, poses, antialias, rows, basis, sh_count, splats
             )
-            for lane in range(min(LANES, count - first)):
+            for lane in range(min(GROUP, count - first)):
                 g = found[first + lane]
                 if write_splat(g, lane, parameters[4], sh_count, rows, basis, splats[g]):
                     tiles = count_tiles(splats[g], width, height)
