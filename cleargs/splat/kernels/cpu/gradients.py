@@ -16,8 +16,12 @@ from cleargs.splat.kernels.cpu.lane_math import GROUP, exp
 from cleargs.splat.kernels.cpu.projection import (
     BLOCK,
     DILATION,
-    POSE_ROWS,
+    INPUT_ROWS,
+    LOG_SCALES,
+    LOGIT,
+    MEAN,
     QUATERNION_EPSILON,
+    ROTATION,
     ZERO,
     Parameters,
     ProjectionView,
@@ -27,20 +31,19 @@ from cleargs.splat.kernels.cpu.projection import (
     cross,
     direction_to,
     dot,
+    lane_quaternion,
     lane_view,
     mixed,
     projection_rows,
-    read_poses,
+    read_gaussian,
     residual,
     scaled_axes,
     set_poses,
-    unit_quaternion,
 )
 from cleargs.types import AnyArray, ArrayF32, ArrayF64
 
-# Rows of the scratch memory: inputs, and the gradients that are written.
-_MEAN, _ROTATION, _LOG_SCALES, _LOGIT = POSE_ROWS, POSE_ROWS + 3, POSE_ROWS + 7, POSE_ROWS + 10
-_SUMS = _LOGIT + 1
+# Rows of the scratch memory after the inputs: sums, and the gradients that are written.
+_SUMS = INPUT_ROWS
 _COLOUR = _SUMS + layout.SUM_RED
 _GRAD_MEAN = _SUMS + layout.PAIR_COLUMNS
 _GRAD_LOG_SCALES, _GRAD_ROTATION, _GRAD_LOGIT = _GRAD_MEAN + 3, _GRAD_MEAN + 6, _GRAD_MEAN + 10
@@ -84,18 +87,11 @@ def gather(
 
     They are those from ``first`` to at most ``last``. The pair sums are added in order and in float64.
     """
-    means, log_scales, rotations, logits, _ = parameters
     columns = pair_sums.shape[1]
     sums = np.zeros(layout.PAIR_COLUMNS)
     for lane in range(GROUP):
         g = touching[min(first + lane, last)]
-        for axis in range(3):
-            rows[_MEAN + axis, lane] = means[g, axis]
-            rows[_LOG_SCALES + axis, lane] = log_scales[g, axis]
-        for part in range(4):
-            rows[_ROTATION + part, lane] = rotations[g, part]
-        rows[_LOGIT, lane] = logits[g]
-        read_poses(poses, g, lane, rows)
+        read_gaussian(g, lane, parameters, poses, rows)
         sums[:] = 0.0
         for pair in range(pair_offsets[g], pair_offsets[g + 1]):
             for column in range(columns):
@@ -116,15 +112,10 @@ def backpropagate_lanes(view: ProjectionView, antialias: bool, rows: ArrayF64) -
     """
     for lane in range(GROUP):
         own = lane_view(view, rows, lane)
-        x, y, z = camera_position(rows[_MEAN, lane], rows[_MEAN + 1, lane], rows[_MEAN + 2, lane], own)
-        qw, qx, qy, qz, norm = unit_quaternion(
-            rows[_ROTATION, lane],
-            rows[_ROTATION + 1, lane],
-            rows[_ROTATION + 2, lane],
-            rows[_ROTATION + 3, lane],
-        )
-        sx, sy = exp(rows[_LOG_SCALES, lane]), exp(rows[_LOG_SCALES + 1, lane])
-        sz = exp(rows[_LOG_SCALES + 2, lane])
+        x, y, z = camera_position(rows[MEAN, lane], rows[MEAN + 1, lane], rows[MEAN + 2, lane], own)
+        qw, qx, qy, qz, norm = lane_quaternion(rows, ROTATION, lane)
+        sx, sy = exp(rows[LOG_SCALES, lane]), exp(rows[LOG_SCALES + 1, lane])
+        sz = exp(rows[LOG_SCALES + 2, lane])
         axis0, axis1, axis2 = scaled_axes(qw, qx, qy, qz, sx, sy, sz)
         row0, row1 = projection_rows(x, y, z, own)
         u0 = (dot(row0, axis0), dot(row0, axis1), dot(row0, axis2))
@@ -139,7 +130,7 @@ def backpropagate_lanes(view: ProjectionView, antialias: bool, rows: ArrayF64) -
         grad_mean_x = a * rows[_SUMS + layout.SUM_VU, lane]
         grad_mean_y = e * rows[_SUMS + layout.SUM_VY, lane] - k * grad_mean_x
         by_alpha = rows[_SUMS + layout.SUM_V, lane]
-        rows[_GRAD_LOGIT, lane] = by_alpha / (1.0 + exp(rows[_LOGIT, lane]))
+        rows[_GRAD_LOGIT, lane] = by_alpha / (1.0 + exp(rows[LOGIT, lane]))
         # d(ln alpha)/dk = a u dy,   dk = e [u1 · du0 + (w - k u1) · du1]
         by_k = e * a * rows[_SUMS + layout.SUM_VUY, lane]
         # d(ln alpha)/ds = ½ a² u²,  ds = 2 w · (du0 - k du1)
@@ -197,9 +188,7 @@ def backpropagate_lanes(view: ProjectionView, antialias: bool, rows: ArrayF64) -
         rows[_GRAD_MEAN, lane] = dot((own.w00, own.w10, own.w20), seen)
         rows[_GRAD_MEAN + 1, lane] = dot((own.w01, own.w11, own.w21), seen)
         rows[_GRAD_MEAN + 2, lane] = dot((own.w02, own.w12, own.w22), seen)
-        direction, distance = direction_to(
-            rows[_MEAN, lane], rows[_MEAN + 1, lane], rows[_MEAN + 2, lane], view
-        )
+        direction, distance = direction_to(rows[MEAN, lane], rows[MEAN + 1, lane], rows[MEAN + 2, lane], view)
         rows[_DIRECTION, lane], rows[_DIRECTION + 1, lane], rows[_DIRECTION + 2, lane] = direction
         rows[_DISTANCE, lane] = distance
 

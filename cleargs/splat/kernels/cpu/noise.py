@@ -13,7 +13,7 @@ from numba import prange
 
 from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.splat.kernels.cpu.lane_math import GROUP, exp, log2
-from cleargs.splat.kernels.cpu.projection import BLOCK, dot, scaled_axes, unit_quaternion
+from cleargs.splat.kernels.cpu.projection import BLOCK, dot, lane_quaternion, scaled_axes
 from cleargs.types import AnyArray, ArrayF32
 
 # The constants of SplitMix64.
@@ -59,12 +59,7 @@ def move_lanes(rows: AnyArray, ids: AnyArray, amount: float, min_opacity: float,
     for lane in range(GROUP):
         a, b = normal_pair(key, np.uint64(2) * ids[lane])
         c, _ = normal_pair(key, np.uint64(2) * ids[lane] + np.uint64(1))
-        w, x, y, z, _ = unit_quaternion(
-            rows[_ROTATION, lane],
-            rows[_ROTATION + 1, lane],
-            rows[_ROTATION + 2, lane],
-            rows[_ROTATION + 3, lane],
-        )
+        w, x, y, z, _ = lane_quaternion(rows, _ROTATION, lane)
         sx, sy = exp(rows[_LOG_SCALES, lane]), exp(rows[_LOG_SCALES + 1, lane])
         m0, m1, m2 = scaled_axes(w, x, y, z, sx, sy, exp(rows[_LOG_SCALES + 2, lane]))
         fade = amount / (1.0 + exp(100.0 * (rows[_OPACITY, lane] - min_opacity)))

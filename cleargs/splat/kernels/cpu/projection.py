@@ -55,11 +55,12 @@ BLOCK = 1024
 
 POSE_ROWS = 12
 """Rows of the scratch memory that hold the pose of each lane."""
-_X, _Y, _Z, _LARGEST, _SEEN = range(POSE_ROWS, POSE_ROWS + 5)
-_ROTATION = _SEEN + 1
-_LOG_SCALES = _ROTATION + 4
-_LOGIT = _LOG_SCALES + 3
-_SPLAT = _LOGIT + 1  # columns of a splat; those of its colour are not used
+MEAN = POSE_ROWS
+ROTATION, LOG_SCALES, LOGIT = MEAN + 3, MEAN + 7, MEAN + 10
+"""First rows of the parameters of each lane; `read_gaussian` writes them."""
+INPUT_ROWS = LOGIT + 1
+_LARGEST, _SEEN = INPUT_ROWS, INPUT_ROWS + 1
+_SPLAT = _SEEN + 1  # columns of a splat; those of its colour are not used
 _REACH = _SPLAT + layout.SPLAT_COLUMNS
 _ROWS = _REACH + 1
 
@@ -114,6 +115,19 @@ def read_poses(poses: AnyArray, g: int, lane: int, rows: ArrayF64) -> None:
     if len(poses) > 0:
         for row in range(POSE_ROWS):
             rows[row, lane] = poses[g, row]
+
+
+@inlined
+def read_gaussian(g: int, lane: int, parameters: Parameters, poses: AnyArray, rows: ArrayF64) -> None:
+    """Write pose and geometry of Gaussian ``g`` for a lane into the first `INPUT_ROWS` of ``rows``."""
+    means, log_scales, rotations, logits, _ = parameters
+    for axis in range(3):
+        rows[MEAN + axis, lane] = means[g, axis]
+        rows[LOG_SCALES + axis, lane] = log_scales[g, axis]
+    for part in range(4):
+        rows[ROTATION + part, lane] = rotations[g, part]
+    rows[LOGIT, lane] = logits[g]
+    read_poses(poses, g, lane, rows)
 
 
 @inlined
@@ -183,6 +197,14 @@ def unit_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, floa
 
 
 @inlined
+def lane_quaternion(rows: ArrayF64, first: int, lane: int) -> tuple[float, float, float, float, float]:
+    """Return `unit_quaternion` of the four rows from ``first`` on."""
+    return unit_quaternion(
+        rows[first, lane], rows[first + 1, lane], rows[first + 2, lane], rows[first + 3, lane]
+    )
+
+
+@inlined
 def scaled_axes(
     w: float, x: float, y: float, z: float, sx: float, sy: float, sz: float
 ) -> tuple[Vector, Vector, Vector]:
@@ -244,12 +266,12 @@ def list_candidates(
     means, log_scales = parameters[0], parameters[1]
     for lane in range(GROUP):
         g = min(first + lane, last)
-        rows[_X, lane], rows[_Y, lane], rows[_Z, lane] = means[g, 0], means[g, 1], means[g, 2]
+        rows[MEAN, lane], rows[MEAN + 1, lane], rows[MEAN + 2, lane] = means[g, 0], means[g, 1], means[g, 2]
         rows[_LARGEST, lane] = max(log_scales[g, 0], log_scales[g, 1], log_scales[g, 2])
         read_poses(poses, g, lane, rows)
     for lane in range(GROUP):
         own = lane_view(view, rows, lane)
-        x, y, z = camera_position(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], own)
+        x, y, z = camera_position(rows[MEAN, lane], rows[MEAN + 1, lane], rows[MEAN + 2, lane], own)
         row0, row1 = projection_rows(x, y, z, own)
         largest = exp(rows[_LARGEST, lane])
         seen = (z >= NEAR) & (z <= FLOAT32_MAX)  # not if z is NaN
@@ -281,39 +303,28 @@ def project_lanes(
     They are the next `GROUP` of ``found``, from ``first`` to at most ``last``. The reach is negative, or NaN,
     for a splat that is too faint or not finite. SH and ``splats`` are only prefetched.
     """
-    means, log_scales, rotations, logits, sh = parameters
+    sh = parameters[4]
     for lane in range(GROUP):
         g = found[min(first + lane, last)]
-        for axis in range(3):
-            rows[_X + axis, lane] = means[g, axis]
-            rows[_LOG_SCALES + axis, lane] = log_scales[g, axis]
-        for part in range(4):
-            rows[_ROTATION + part, lane] = rotations[g, part]
-        rows[_LOGIT, lane] = logits[g]
-        read_poses(poses, g, lane, rows)
+        read_gaussian(g, lane, parameters, poses, rows)
         for line in range(0, 3 * sh_count, 16):
             prefetch(sh, g * sh.shape[1] * 3 + line)
         prefetch_to_write(splats, g * layout.SPLAT_COLUMNS)
     for lane in range(GROUP):
         own = lane_view(view, rows, lane)
-        x, y, z = camera_position(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], own)
+        x, y, z = camera_position(rows[MEAN, lane], rows[MEAN + 1, lane], rows[MEAN + 2, lane], own)
         row0, row1 = projection_rows(x, y, z, own)
         mean_x, mean_y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-        qw, qx, qy, qz, _ = unit_quaternion(
-            rows[_ROTATION, lane],
-            rows[_ROTATION + 1, lane],
-            rows[_ROTATION + 2, lane],
-            rows[_ROTATION + 3, lane],
-        )
-        sx, sy = exp(rows[_LOG_SCALES, lane]), exp(rows[_LOG_SCALES + 1, lane])
-        axis0, axis1, axis2 = scaled_axes(qw, qx, qy, qz, sx, sy, exp(rows[_LOG_SCALES + 2, lane]))
+        qw, qx, qy, qz, _ = lane_quaternion(rows, ROTATION, lane)
+        sx, sy = exp(rows[LOG_SCALES, lane]), exp(rows[LOG_SCALES + 1, lane])
+        axis0, axis1, axis2 = scaled_axes(qw, qx, qy, qz, sx, sy, exp(rows[LOG_SCALES + 2, lane]))
         u0 = (dot(row0, axis0), dot(row0, axis1), dot(row0, axis2))
         u1 = (dot(row1, axis0), dot(row1, axis1), dot(row1, axis2))
         xx, xy, yy = dot(u0, u0) + DILATION, dot(u0, u1), dot(u1, u1) + DILATION
         skew = xy / yy
         w = residual(u0, u1, skew)
         variance = dot(w, w) + DILATION * (1.0 + skew * skew)
-        log2_opacity = -log2(1.0 + exp(-rows[_LOGIT, lane]))
+        log2_opacity = -log2(1.0 + exp(-rows[LOGIT, lane]))
         if antialias:
             normal = cross(w, u1)
             log2_opacity += 0.5 * log2(dot(normal, normal) / (variance * yy))
@@ -330,7 +341,7 @@ def project_lanes(
         rows[_SPLAT + layout.EXTENT_X, lane] = math.sqrt(reach * xx)
         rows[_SPLAT + layout.EXTENT_Y, lane] = math.sqrt(reach * yy)
         rows[_SPLAT + layout.EXTENT_X_AT, lane] = xy * math.sqrt(reach / xx)
-        direction, _ = direction_to(rows[_X, lane], rows[_Y, lane], rows[_Z, lane], view)
+        direction, _ = direction_to(rows[MEAN, lane], rows[MEAN + 1, lane], rows[MEAN + 2, lane], view)
         sh_basis(np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2]), basis, lane)
 
 
