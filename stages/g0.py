@@ -10,7 +10,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.scene.config import G0Config, kernel_libraries
 from cleargs.scene.folder import LOG, TRAINED
 
-VERSION = 65
+VERSION = 66
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 AUTO_SHARE = 1 / 16
 """Share of the frames that `auto` is expected to repair, for estimates."""
 
-VERSION = 72
+VERSION = 73
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {

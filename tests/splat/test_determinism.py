@@ -66,7 +66,7 @@ def test_training_is_bitwise_equal_across_threads_and_runs():
 NEEDLES = """
 import hashlib, torch
 from helpers.splat_scenes import make_camera, make_gaussians, make_needles
-from cleargs.splat.kernels.cpu.backend import rasteriser
+from cleargs.splat.kernels.cpu.backend import add_position_noise, rasteriser
 
 camera, engine, result = make_camera(), rasteriser(torch.device("cpu")), hashlib.sha256()
 sizes = [(n, 10.0**power) for n in range(60, 70) for power in (4, 6, 8)]
@@ -77,6 +77,8 @@ for gaussians in (make_gaussians(camera, 200), *needles):
     slope = torch.sin(torch.arange(image.numel())).view(image.shape)
     for gradient in engine.backward(slope).tensors().values():
         result.update(gradient.numpy().tobytes())
+    add_position_noise(gaussians, amount=1.0, min_opacity=0.5, seed=(0,))
+    result.update(gaussians.means.numpy().tobytes())
 print(result.hexdigest())
 """
 

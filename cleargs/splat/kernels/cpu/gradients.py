@@ -11,7 +11,7 @@ from numba import prange
 
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.harmonics import FUNCTIONS, sh_basis, sh_direction_gradient
-from cleargs.splat.kernels.cpu.jit import inlined, kernel
+from cleargs.splat.kernels.cpu.jit import kernel, unfused
 from cleargs.splat.kernels.cpu.lane_math import GROUP, exp
 from cleargs.splat.kernels.cpu.projection import (
     BLOCK,
@@ -52,13 +52,13 @@ _DISTANCE = _DIRECTION + 3
 ROWS = _DISTANCE + 1
 
 
-@inlined
+@unfused
 def plus(u: Vector, a: float, v: Vector) -> Vector:
     """Return u + a v."""
     return (u[0] + a * v[0], u[1] + a * v[1], u[2] + a * v[2])
 
 
-@inlined
+@unfused
 def quaternion_gradient(
     w: float, x: float, y: float, z: float, c0: Vector, c1: Vector, c2: Vector
 ) -> tuple[float, float, float, float]:
@@ -71,7 +71,7 @@ def quaternion_gradient(
     )
 
 
-@inlined
+@unfused
 def gather(
     touching: AnyArray,
     first: int,
@@ -103,7 +103,7 @@ def gather(
                 rows[_COLOUR + channel, lane] = 0.0
 
 
-@inlined
+@unfused
 def backpropagate_lanes(view: ProjectionView, antialias: bool, rows: ArrayF64) -> None:
     """Apply the chain rule of ``project_lanes`` to the pixel sums in ``rows``.
 
@@ -193,7 +193,7 @@ def backpropagate_lanes(view: ProjectionView, antialias: bool, rows: ArrayF64) -
         rows[_DISTANCE, lane] = distance
 
 
-@inlined
+@unfused
 def colour_lanes(
     touching: AnyArray,
     first: int,
@@ -226,7 +226,7 @@ def colour_lanes(
         rows[_GRAD_MEAN + 2, lane] += (towards[2] - radial * direction[2]) / distance
 
 
-@inlined
+@unfused
 def write_gradients(
     g: int, lane: int, sh_count: int, rows: ArrayF64, basis: ArrayF32, outputs: Parameters
 ) -> None:
@@ -250,7 +250,7 @@ def write_gradients(
             grad_sh[g, k, channel] = ZERO
 
 
-@inlined
+@unfused
 def write_zeros(g: int, outputs: Parameters) -> None:
     grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
     for axis in range(3):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cpu.jit import inlined
+from cleargs.splat.kernels.cpu.jit import unfused
 from cleargs.types import ArrayF32
 
 FUNCTIONS = 16
@@ -20,7 +20,7 @@ C30, C31, C32, C33, C34, C35, C36 = (np.float32(c) for c in constants.SH_C3)
 TWO, THREE, FOUR, SIX, EIGHT = (np.float32(n) for n in (2, 3, 4, 6, 8))
 
 
-@inlined
+@unfused
 def sh_basis(x: np.float32, y: np.float32, z: np.float32, basis: ArrayF32, lane: int) -> None:
     """Write the basis functions at the unit direction (x, y, z) into the rows of ``basis`` [16, lanes]."""
     xx, yy, zz = x * x, y * y, z * z
@@ -42,7 +42,7 @@ def sh_basis(x: np.float32, y: np.float32, z: np.float32, basis: ArrayF32, lane:
     basis[15, lane] = C36 * x * (xx - THREE * yy)
 
 
-@inlined
+@unfused
 def sh_direction_gradient(
     x: np.float32, y: np.float32, z: np.float32, h: ArrayF32, lane: int
 ) -> tuple[np.float32, np.float32, np.float32]:

@@ -87,7 +87,10 @@ def inlined(function: F) -> F:
 
 
 def unfused(function: F) -> F:
-    """Compile like `inlined`, but with a rounding after each operation, so that all callers round alike."""
+    """Compile like `inlined`, but with a rounding after each operation, so that all callers round alike.
+
+    It is for loops over Gaussians whose sums have several products.
+    """
     flags = FAST - {"contract"}
     return cast(F, njit(fastmath=set(flags), error_model="numpy", forceinline=True)(function))
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import prange
 
-from cleargs.splat.kernels.cpu.jit import inlined, kernel
+from cleargs.splat.kernels.cpu.jit import kernel, unfused
 from cleargs.splat.kernels.cpu.lane_math import GROUP, exp, log2
 from cleargs.splat.kernels.cpu.projection import BLOCK, dot, lane_quaternion, scaled_axes
 from cleargs.types import AnyArray, ArrayF32
@@ -30,7 +30,7 @@ _OPACITY, _ROTATION, _LOG_SCALES, _MOVE, _ROWS = 0, 1, 5, 8, 11
 """Rows of the scratch memory."""
 
 
-@inlined
+@unfused
 def random_bits(key: np.uint64, count: np.uint64) -> np.uint64:
     """Return 64 random bits: number ``count`` of the sequence with this key."""
     bits = key + (count + np.uint64(1)) * _GOLDEN
@@ -39,7 +39,7 @@ def random_bits(key: np.uint64, count: np.uint64) -> np.uint64:
     return bits ^ (bits >> np.uint64(31))
 
 
-@inlined
+@unfused
 def normal_pair(key: np.uint64, count: np.uint64) -> tuple[float, float]:
     """Return two independent normal numbers (Box and Muller 1958), at most 6.8 standard deviations."""
     bits = random_bits(key, count)
@@ -53,7 +53,7 @@ def normal_pair(key: np.uint64, count: np.uint64) -> tuple[float, float]:
     return length * cosine, length * sine * turn
 
 
-@inlined
+@unfused
 def move_lanes(rows: AnyArray, ids: AnyArray, amount: float, min_opacity: float, key: np.uint64) -> None:
     """Write the move of the mean of each lane."""
     for lane in range(GROUP):

@@ -35,7 +35,7 @@ from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.binning import count_tiles
 from cleargs.splat.kernels.cpu.harmonics import FUNCTIONS, sh_basis
-from cleargs.splat.kernels.cpu.jit import inlined, kernel, unfused
+from cleargs.splat.kernels.cpu.jit import kernel, unfused
 from cleargs.splat.kernels.cpu.lane_math import GROUP, exp, log2
 from cleargs.splat.kernels.cpu.simd import prefetch, prefetch_to_write
 from cleargs.types import AnyArray, ArrayF32, ArrayF64
@@ -101,7 +101,7 @@ class ProjectionView(NamedTuple):
     bottom: float
 
 
-@inlined
+@unfused
 def set_poses(view: ProjectionView, rows: ArrayF64) -> None:
     """Write the pose of ``view`` for all lanes into the first `POSE_ROWS` of ``rows``."""
     for row in range(POSE_ROWS):
@@ -109,7 +109,7 @@ def set_poses(view: ProjectionView, rows: ArrayF64) -> None:
             rows[row, lane] = view[row]
 
 
-@inlined
+@unfused
 def read_poses(poses: AnyArray, g: int, lane: int, rows: ArrayF64) -> None:
     """Write the pose of Gaussian ``g`` for a lane; nothing if ``poses`` is [0, 12]."""
     if len(poses) > 0:
@@ -117,7 +117,7 @@ def read_poses(poses: AnyArray, g: int, lane: int, rows: ArrayF64) -> None:
             rows[row, lane] = poses[g, row]
 
 
-@inlined
+@unfused
 def read_gaussian(g: int, lane: int, parameters: Parameters, poses: AnyArray, rows: ArrayF64) -> None:
     """Write pose and geometry of Gaussian ``g`` for a lane into the first `INPUT_ROWS` of ``rows``."""
     means, log_scales, rotations, logits, _ = parameters
@@ -130,7 +130,7 @@ def read_gaussian(g: int, lane: int, parameters: Parameters, poses: AnyArray, ro
     read_poses(poses, g, lane, rows)
 
 
-@inlined
+@unfused
 def lane_view(view: ProjectionView, rows: ArrayF64, lane: int) -> ProjectionView:
     """Return the view of a lane: ``view`` with the pose in ``rows``."""
     return ProjectionView(
@@ -141,12 +141,12 @@ def lane_view(view: ProjectionView, rows: ArrayF64, lane: int) -> ProjectionView
     )  # fmt: skip
 
 
-@inlined
+@unfused
 def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined
+@unfused
 def cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
@@ -157,20 +157,20 @@ def mixed(a: float, u: Vector, b: float, v: Vector) -> Vector:
     return (a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2])
 
 
-@inlined
+@unfused
 def residual(u0: Vector, u1: Vector, skew: float) -> Vector:
     """Return w = u0 - k u1, the variation of x at fixed y."""
     return (u0[0] - skew * u1[0], u0[1] - skew * u1[1], u0[2] - skew * u1[2])
 
 
-@inlined
+@unfused
 def is_finite(x: Any) -> bool:
     """Return True if a float64 is in the range of float32, in which it is stored; False for NaN."""
     finite: bool = abs(x) <= FLOAT32_MAX
     return finite
 
 
-@inlined
+@unfused
 def camera_position(x: float, y: float, z: float, view: ProjectionView) -> Vector:
     """Return a point of the world, float64, in camera coordinates."""
     return (
@@ -180,7 +180,7 @@ def camera_position(x: float, y: float, z: float, view: ProjectionView) -> Vecto
     )
 
 
-@inlined
+@unfused
 def direction_to(x: float, y: float, z: float, view: ProjectionView) -> tuple[Vector, float]:
     """Return the unit vector in the world from the camera to a point, and their distance."""
     x, y, z = x - view.centre_x, y - view.centre_y, z - view.centre_z
@@ -188,7 +188,7 @@ def direction_to(x: float, y: float, z: float, view: ProjectionView) -> tuple[Ve
     return (x / distance, y / distance, z / distance), distance
 
 
-@inlined
+@unfused
 def unit_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
     """Return the normalised quaternion w x y z and the norm that it was divided by."""
     norm = math.sqrt(w * w + x * x + y * y + z * z)
@@ -196,7 +196,7 @@ def unit_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, floa
     return w / norm, x / norm, y / norm, z / norm, norm
 
 
-@inlined
+@unfused
 def lane_quaternion(rows: ArrayF64, first: int, lane: int) -> tuple[float, float, float, float, float]:
     """Return `unit_quaternion` of the four rows from ``first`` on."""
     return unit_quaternion(
@@ -204,7 +204,7 @@ def lane_quaternion(rows: ArrayF64, first: int, lane: int) -> tuple[float, float
     )
 
 
-@inlined
+@unfused
 def scaled_axes(
     w: float, x: float, y: float, z: float, sx: float, sy: float, sz: float
 ) -> tuple[Vector, Vector, Vector]:
@@ -216,13 +216,13 @@ def scaled_axes(
     )
 
 
-@inlined
+@unfused
 def bounded(value: float, low: float, high: float) -> float:
     value = low if value < low else value
     return high if value > high else value
 
 
-@inlined
+@unfused
 def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple[Vector, Vector]:
     """Return the rows of J W. The clamps of x/z and y/z keep the linearisation near the image."""
     jx, jy = view.fx / z, view.fy / z
@@ -234,7 +234,7 @@ def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple
     )
 
 
-@inlined
+@unfused
 def outside(mean: float, size: int, row: Vector, largest: float) -> bool:
     """Return True if an opaque sphere with the ``largest`` scale would touch no pixel; False for NaN.
 
@@ -246,7 +246,7 @@ def outside(mean: float, size: int, row: Vector, largest: float) -> bool:
     return (mean + extent < 0.0) | (mean - extent > size + layout.TILE)
 
 
-@inlined
+@unfused
 def list_candidates(
     first: int,
     last: int,
@@ -284,7 +284,7 @@ def list_candidates(
     return count
 
 
-@inlined
+@unfused
 def project_lanes(
     found: AnyArray,
     first: int,
@@ -345,7 +345,7 @@ def project_lanes(
         sh_basis(np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2]), basis, lane)
 
 
-@inlined
+@unfused
 def write_splat(
     g: int, lane: int, sh: ArrayF32, sh_count: int, rows: ArrayF64, basis: ArrayF32, splat: ArrayF32
 ) -> bool:
