@@ -19,16 +19,17 @@ SETTINGS = {
 }
 SCORER = "clarity-net"
 STORED = {
-    ("mixed", "observed"): {"g0": (30.94, 90.4), "rivr": (31.04, 90.6), "consolidate": (31.06, 90.8)},
-    ("mixed", "novel"): {"g0": (29.64, 90.2), "rivr": (29.68, 90.4), "consolidate": (29.69, 90.6)},
-    ("gs2e-medium", "observed"): {"g0": (33.86, 85.1), "rivr": (34.05, 85.1), "consolidate": (34.20, 85.4)},
-    ("gs2e-medium", "novel"): {"g0": (31.93, 84.7), "rivr": (32.05, 84.8), "consolidate": (32.13, 85.0)},
+    ("mixed", "observed"): {"g0": (30.98, 90.4), "rivr": (31.14, 90.6), "consolidate": (31.15, 90.8)},
+    ("mixed", "novel"): {"g0": (29.65, 90.2), "rivr": (29.73, 90.5), "consolidate": (29.73, 90.6)},
+    ("gs2e-medium", "observed"): {"g0": (34.03, 85.2), "rivr": (34.21, 85.3), "consolidate": (34.38, 85.5)},
+    ("gs2e-medium", "novel"): {"g0": (32.23, 84.8), "rivr": (32.36, 84.9), "consolidate": (32.46, 85.0)},
 }
 """Protocol and views -> stage -> PSNR, dB, of its scene at the true sharp views, and the score of its
 renders, which predicts their LPIPS (whose own network is not shipped). Store new figures in the commit that
 changes a result, and give both in its body."""
 TOLERANCE_DB, TOLERANCE_SCORE = 0.3, 1.0
-"""Other processors round otherwise, which changes the figures by less than 0.1 dB."""
+"""Another processor changed the figures by less than 0.1 dB. Other bits of a kernel may change them more: the
+order of roundings once by 0.33 dB, other seeds by up to 0.75 dB. So a failure asks for a look at whole scenes."""
 
 
 @pytest.mark.slow
