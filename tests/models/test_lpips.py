@@ -121,6 +121,13 @@ def test_equals_the_original_layout(checkpoint: dict[str, Any], installed: Path)
     assert load_lpips("alex", installed).distance(a, b) == pytest.approx(expected, rel=1e-4)
 
 
+def test_weights_may_be_read_by_whoever_may_read_other_files(installed: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.touch()
+    for net in LPIPS_NETS:
+        assert (installed / weights_file(net)).stat().st_mode == other.stat().st_mode
+
+
 def test_lpips_is_a_distance(installed: Path) -> None:
     lpips = load_lpips("alex", installed)
     a, b = pair()
