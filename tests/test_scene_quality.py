@@ -29,7 +29,7 @@ renders, which predicts their LPIPS (whose own network is not shipped). Store ne
 changes a result, and give both in its body."""
 TOLERANCE_DB, TOLERANCE_SCORE = 0.3, 1.0
 """Another processor changed the figures by less than 0.1 dB. Other bits of a kernel may change them more: the
-order of roundings once by 0.33 dB, other seeds by up to 0.75 dB. So a failure asks for a look at whole scenes."""
+order of roundings once by 0.33 dB, other seeds by up to 0.75 dB. A failure asks for a look at scenes."""
 
 
 @pytest.mark.slow
