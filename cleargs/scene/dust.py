@@ -61,7 +61,8 @@ def without_dust(
 ) -> Dusted:
     """Remove the `DUST` of a training, with its moments of Adam, and draw in what is `FAR` outside.
 
-    Each of both happens only if there are frames, and they lose at most `MAX_LOSS`.
+    Each of both happens only if there are frames, and they lose at most `MAX_LOSS`. ``trained`` must not be
+    used again: its state is changed.
     """
     real = [view for view in views if view.kind == "real"]
     if not real:
@@ -92,14 +93,12 @@ def without_dust(
             scene, fits = nearer, found
         else:
             far[:] = False
-    state = trained.state
-    if not seen.all():
-        kept = seen.cpu()
-        state = {
-            name: tensor[kept] if name.startswith(("first.", "second.", "strategy.")) else tensor
-            for name, tensor in state.items()
-        }
-    done = replace(trained, scene=scene.to("cpu"), state=state)
+    state, kept = trained.state, seen.cpu()
+    if not kept.all():
+        for name in state:  # one after the other, so that there are never two whole copies
+            if name.startswith(("first.", "second.", "strategy.")):
+                state[name] = state[name][kept]
+    done = replace(trained, scene=scene.to("cpu"))
     return Dusted(done, int((~seen).sum()), int(far.sum()), few, fits)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure
+from cleargs.memory import release_freed
 from cleargs.progress import Reporter
 from cleargs.scene.dust import Dusted, without_dust
 from cleargs.scene.folder import SceneFolder
@@ -36,8 +37,14 @@ def train_into(
     **options: Any,  # for `Trainer`
 ) -> Dusted:
     """Train a scene, remove its dust and write the files of `SceneFolder` into ``folder``."""
-    trainer = Trainer(scene, views, config, formation=formation, device=device, **options)
-    trained = run(trainer, checkpoint=checkpoint, reporter=reporter, label=label, round=round)
+    trained = run(
+        Trainer(scene, views, config, formation=formation, device=device, **options),  # freed after it
+        checkpoint=checkpoint,
+        reporter=reporter,
+        label=label,
+        round=round,
+    )
+    release_freed()
     learned = formation.exposure or exposure
     dusted = Dusted(trained, 0, 0, [], [])
     if dust:

@@ -38,6 +38,7 @@ _MODES = {
     "cleargs antialias mip": True,  # ClearGS up to 0.2
     "cleargs antialias none": False,
 }
+_ROWS = 65536  # Gaussians that are written at a time, so that there is no second copy of a scene
 _MAX_LINE_BYTES = 4096  # maximum length of a line in the header
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -64,14 +65,6 @@ def write_ply(path: Path, scene: Scene) -> None:
         *(f"scale_{i}" for i in range(3)),
         *(f"rot_{i}" for i in range(4)),
     ]
-    rows = np.zeros((count, len(names)), dtype="<f4")
-    rows[:, 0:3] = gaussians.means.numpy()
-    rows[:, 6:9] = gaussians.sh.numpy()[:, 0]
-    by_colour = gaussians.sh.numpy()[:, 1:].transpose(0, 2, 1)  # [N, 3, K - 1]
-    rows[:, 9:-8] = by_colour.reshape(count, 3 * (coefficients - 1))
-    rows[:, -8] = gaussians.logit_opacities.numpy()
-    rows[:, -7:-4] = gaussians.log_scales.numpy()
-    rows[:, -4:] = gaussians.rotations.numpy()
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -83,7 +76,21 @@ def write_ply(path: Path, scene: Scene) -> None:
     ]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
-        file.write(rows.tobytes())
+        for begin in range(0, count, _ROWS):
+            file.write(_rows(gaussians, slice(begin, begin + _ROWS), len(names)).data)
+
+
+def _rows(gaussians: Gaussians, part: slice, width: int) -> NDArray[np.float32]:
+    """Return rows of the table of a PLY, with ``width`` columns; normals are 0."""
+    means, sh = gaussians.means.numpy()[part], gaussians.sh.numpy()[part]
+    rows = np.zeros((len(means), width), dtype="<f4")
+    rows[:, 0:3] = means
+    rows[:, 6:9] = sh[:, 0]
+    rows[:, 9:-8] = sh[:, 1:].transpose(0, 2, 1).reshape(len(means), width - 17)  # by colour
+    rows[:, -8] = gaussians.logit_opacities.numpy()[part]
+    rows[:, -7:-4] = gaussians.log_scales.numpy()[part]
+    rows[:, -4:] = gaussians.rotations.numpy()[part]
+    return rows
 
 
 def read_ply(path: Path) -> Scene:

@@ -5,14 +5,15 @@ Everything is stored as a tensor, even the step: safetensors writes several meta
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from cleargs.errors import StoreError
-from cleargs.files import write_bytes
+from cleargs.files import atomic_path, disk_error
 from cleargs.progress import Reporter
 from cleargs.safe_io import cause
 from cleargs.splat.gaussians import Gaussians
@@ -20,8 +21,21 @@ from cleargs.splat.types import Moments
 
 
 def save_state(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write named tensors atomically; equal tensors give equal bytes."""
-    write_bytes(path, save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}))
+    """Write named tensors atomically, without a copy in memory; equal tensors give equal bytes.
+
+    Raises StoreError if the disk is full or not writable.
+    """
+    with atomic_path(path) as temporary:
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        try:
+            save_file(
+                {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, temporary
+            )
+        except SafetensorError as error:  # of a disk, too: the number is only in its text
+            number = re.search(r"os error (\d+)", str(error))
+            raise disk_error(OSError(int(number[1]) if number else 0, str(error)), path) from error
+        temporary.chmod(mode)  # safetensors replaces the file by one that only its owner may read
 
 
 def load_state(path: Path, reporter: Reporter) -> dict[str, Tensor] | None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, views
+from safetensors import SafetensorError
 
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
@@ -188,6 +189,22 @@ def test_moments_of_another_scene_are_refused(tmp_path: Path) -> None:
     save_state(path, Moments.zeros(start(59).gaussians).state())
     with pytest.raises(StoreError, match="do not fit the scene"):
         read_moments(path, start().gaussians)
+
+
+def test_a_state_may_be_read_by_whoever_may_read_other_files(tmp_path: Path) -> None:
+    save_state(tmp_path / "state.safetensors", {"step": torch.tensor(0)})
+    (tmp_path / "other").touch()
+    assert (tmp_path / "state.safetensors").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr("cleargs.splat.state.save_file", full)
+    with pytest.raises(StoreError, match="no space left on the disk"):
+        save_state(tmp_path / "state.safetensors", {"step": torch.tensor(0)})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_part_ends_after_its_begin() -> None:
