@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import cv2
@@ -129,14 +130,14 @@ def decode_with_grey(
     InputError as `decode_frames` does.
     """
     missing, in_grey = set(pts), set(grey)
-    for number, frame, aspect in _decoded(path, missing | in_grey):
-        wide = max(1, round(aspect * frame.width))
+    for number, frame, display in _decoded(path, missing | in_grey):
+        wide = max(1, round(display.aspect * frame.width))
         rgb = None
         if number in missing:
             missing.discard(number)
             _require_few(f"{path.name}: a frame would have", wide, frame.height, "square pixels")
-            rgb = _oriented(frame, wide)
-        yield number, rgb, _turned(_grey(frame), frame, wide) if number in in_grey else None
+            rgb = _turned(_rgb(frame), wide, display)
+        yield number, rgb, _turned(_grey(frame), wide, display) if number in in_grey else None
     if missing:
         raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
 
@@ -159,17 +160,41 @@ def _grey(frame: VideoFrame, long_side: int | None = None) -> ImageU8:  # [H, W]
     return np.asarray(grey.to_ndarray(), np.uint8)
 
 
-def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame, float]]:
-    """Yield the wanted frames that can be decoded, with the width of their pixels over the height."""
-    wanted = set(pts)
+class _Display(NamedTuple):
+    """How the frames of a video are shown."""
+
+    aspect: float
+    """Width of a stored pixel over its height."""
+    matrix: tuple[int, int, int, int]
+    """(a, b, c, d) of the display matrix. It maps a stored pixel (x, y) to (a x + c y, b x + d y)."""
+
+
+def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame, _Display]]:
+    """Yield the wanted frames that can be decoded; they are all shown as the first of them."""
+    wanted, display = set(pts), None
     with _open(path) as (container, stream):
         stream.thread_type = "AUTO"
         for frame in _progressive(container, stream):
             if frame.pts in wanted:
                 wanted.discard(frame.pts)
-                yield frame.pts, frame, float(stream.sample_aspect_ratio or 1.0)
+                if display is None:
+                    display = _Display(float(stream.sample_aspect_ratio or 1.0), _display_matrix(frame))
+                yield frame.pts, frame, display
             if not wanted:
                 return
+
+
+def _display_matrix(frame: VideoFrame) -> tuple[int, int, int, int]:
+    """Return the display matrix (`_Display`). `VideoFrame.rotation` has no mirroring.
+
+    A frame whose side data were read stays in memory until Python looks for cycles of references, so only
+    one frame of a video is asked.
+    """
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if not isinstance(matrix, SideData):
+        return 1, 0, 0, 1
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    return a, b, c, d
 
 
 def _progressive(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
@@ -199,32 +224,20 @@ def _require_few(subject: str, width: int, height: int, what: str = "pixels") ->
         raise InputError(f"{subject} {width}x{height} {what}; at most {MAX_PIXELS} are read", hint=_HINT)
 
 
-def _oriented(frame: VideoFrame, width: int) -> ImageU8:  # [H, W, 3]
-    """Return a decoded frame as upright sRGB; ``width`` is its width in square pixels before rotation."""
+def _rgb(frame: VideoFrame) -> ImageU8:  # [H, W, 3]
+    """Return the stored picture of a frame as sRGB."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
-    return _turned(np.asarray(rgb, np.uint8), frame, width)
+    return np.asarray(rgb, np.uint8)
 
 
-def _turned(picture: ImageU8, frame: VideoFrame, width: int) -> ImageU8:  # [H, W] or [H, W, 3]
-    """Return the stored picture of ``frame`` with square pixels, ``width`` of them in a row, and upright."""
-    if width != frame.width:
-        picture = np.asarray(
-            cv2.resize(picture, (width, frame.height), interpolation=cv2.INTER_CUBIC), np.uint8
-        )
-    return np.ascontiguousarray(_displayed(picture, frame))
-
-
-def _displayed(picture: ImageU8, frame: VideoFrame) -> ImageU8:  # [H, W] or [H, W, 3]
-    """Return the picture turned in quarters and mirrored, as the display matrix of its ``frame`` says.
-
-    The matrix maps a stored pixel (x, y) to (a x + c y, b x + d y). `VideoFrame.rotation` has no mirroring.
-    """
-    matrix = frame.side_data.get("DISPLAYMATRIX")
-    if not isinstance(matrix, SideData):
-        return picture
-    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+def _turned(picture: ImageU8, width: int, display: _Display) -> ImageU8:  # [H, W] or [H, W, 3]
+    """Return a stored picture with square pixels, ``width`` of them in a row, turned and mirrored."""
+    height = picture.shape[0]
+    if width != picture.shape[1]:
+        picture = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
+    a, b, c, d = display.matrix
     turned, across, down = (picture.swapaxes(0, 1), c, b) if abs(b) > abs(a) else (picture, a, d)
-    return turned[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]
+    return np.ascontiguousarray(turned[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
 
 
 def _signal(frame: VideoFrame) -> ImageF32:  # [H, W, 3]
