@@ -57,13 +57,13 @@ def distillation(context: StageContext[Any], config: DistilConfig) -> TrainingCo
 def expected(context: StageContext[Any], cost: TrainingCost, cache_mb: int, seconds: float = 0.0) -> Estimate:
     """Return the cost of a stage with this training, and ``seconds`` of other work on two idle cores.
 
-    Memory is taken by libraries, Gaussians (1.8 to 3.5 kB each in four real captures) and decoded images, up
+    Memory is taken by libraries, Gaussians (about 2 kB each in four real captures) and decoded images, up
     to ``cache_mb``. Disk is taken by the scene and its moments, 0.7 kB per Gaussian of SH degree 3.
     """
     frames, megapixels = capture_size(context)
     return Estimate(
         minutes=(cost.seconds + seconds) * thread_factor(context.threads) / 60.0,
-        memory_gb=1.0 + 2.7e-6 * cost.gaussians + min(cache_mb / 1024, 0.003 * megapixels * frames),
+        memory_gb=0.85 + 2.0e-6 * cost.gaussians + min(cache_mb / 1024, 0.003 * megapixels * frames),
         disk_gb=0.7e-6 * cost.gaussians,
     )
 
