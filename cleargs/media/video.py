@@ -161,7 +161,7 @@ def _grey(frame: VideoFrame, long_side: int | None = None) -> ImageU8:  # [H, W]
 
 
 class _Display(NamedTuple):
-    """How the frames of a video are shown."""
+    """Shape of the pixels of a video, and its display matrix."""
 
     aspect: float
     """Width of a stored pixel over its height."""

@@ -32,7 +32,7 @@ def save_state(path: Path, tensors: dict[str, Tensor]) -> None:
             save_file(
                 {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, temporary
             )
-        except SafetensorError as error:  # of a disk, too: the number is only in its text
+        except SafetensorError as error:  # for a full disk, too, whose number is only in the text
             number = re.search(r"os error (\d+)", str(error))
             raise disk_error(OSError(int(number[1]) if number else 0, str(error)), path) from error
         temporary.chmod(mode)  # safetensors replaces the file by one that only its owner may read
