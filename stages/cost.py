@@ -57,7 +57,7 @@ def distillation(context: StageContext[Any], config: DistilConfig) -> TrainingCo
 def expected(context: StageContext[Any], cost: TrainingCost, cache_mb: int, seconds: float = 0.0) -> Estimate:
     """Return the cost of a stage with this training, and ``seconds`` of other work on two idle cores.
 
-    Memory is taken by libraries, Gaussians (about 2 kB each in four real captures) and decoded images, up
+    Memory is taken by libraries, Gaussians (1.4 to 2.2 kB each in four real captures) and decoded images, up
     to ``cache_mb``. Disk is taken by the scene and its moments, 0.7 kB per Gaussian of SH degree 3.
     """
     frames, megapixels = capture_size(context)
